@@ -1,0 +1,190 @@
+"""Pairs made from shapes: the published test procedures, and the same operations for training.
+
+The operations draw from the generator they are given and do nothing else that is random, so that
+`fixed_pair` repeats, draw by draw, the test set on which RPM-Net (Yew & Lee, 2020) and its
+successors publish their results. A generator is numpy's legacy `RandomState` or a `Generator`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from cfr_jax.data.corpus import Corpus
+from cfr_jax.data.pairs import Pair
+
+Rng = np.random.RandomState | np.random.Generator
+
+NOISE_SCALE = 0.01
+NOISE_CLIP = 0.05
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How a pair is made of a shape.
+
+    Without crop and without noise the two clouds hold the very same points, drawn once, and those
+    are the whole shape as far as the pair knows; otherwise each cloud is drawn on its own.
+    """
+
+    name: str
+    points: int = 1024  # of a whole shape; a cropped cloud has ceil(keep * points)
+    keep: float | None = None  # share of the shape that a crop leaves
+    noise: bool = True  # N(0, 0.01), clipped to 0.05
+    angle: float = 45.0  # degrees; each Euler angle is drawn from [0, angle]
+    translation: float = 0.5  # each coordinate is drawn from [-translation, translation]
+
+    def __post_init__(self):
+        if self.points < 1:
+            raise ValueError(f"points is {self.points}, wanted at least 1")
+        if self.keep is not None and not 0 < self.keep < 1:
+            raise ValueError(f"keep is {self.keep}, wanted None or a share between 0 and 1")
+
+
+clean = Protocol("clean", noise=False)
+noise = Protocol("noise")
+partial = Protocol("partial", keep=0.7)
+low_overlap = Protocol("low_overlap", keep=0.5)
+
+
+def fixed_pair(corpus: Corpus, index: int, protocol: Protocol) -> Pair:
+    """Pair `index` of the published test set that `protocol` makes of `corpus`.
+
+    The legacy generator starts anew from the index before the crop, the motion and the draw of
+    points; `clean` takes the first points instead of drawing.
+    """
+    if not 0 <= index < len(corpus):
+        raise ValueError(f"index is {index}, wanted 0 to {len(corpus) - 1}")
+    points, normals = corpus[index]
+    first = np.arange(protocol.points) % len(points)
+    return _make_pair(
+        corpus.names[index],
+        points,
+        normals,
+        protocol,
+        reseed=lambda: np.random.RandomState(index),
+        shared=lambda _: first,
+    )
+
+
+def random_pair(
+    points: Float32[np.ndarray, "p 3"],
+    normals: Float32[np.ndarray, "p 3"],
+    protocol: Protocol,
+    rng: Rng,
+    name: str = "",
+) -> Pair:
+    """A fresh pair of a shape, for training."""
+    return _make_pair(
+        name,
+        points,
+        normals,
+        protocol,
+        reseed=lambda: rng,
+        shared=lambda rng: resample(len(points), protocol.points, rng),
+    )
+
+
+def crop(points: Float[np.ndarray, "p 3"], keep: float, rng: Rng) -> Int[np.ndarray, " kept"]:
+    """Rows on the far side of a plane with a random normal that leaves a share of `keep`.
+
+    At exactly one half the plane goes through the mean, as in the published low-overlap sets, so
+    the share is one half only roughly. Raises ValueError where no point is left.
+    """
+    azimuth = rng.uniform(0.0, 2 * np.pi)
+    polar = np.arccos(rng.uniform(-1.0, 1.0))
+    direction = np.array(
+        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
+    )
+    height = (points - points.mean(axis=0)) @ direction
+    # The published share is a float32; in float64, (1 - 0.7) * 100 is then not quite 30.
+    percentile = (1.0 - float(np.float32(keep))) * 100
+    plane = 0.0 if keep == 0.5 else np.percentile(height, percentile)
+    kept = np.flatnonzero(height > plane)
+    if not len(kept):
+        raise ValueError(f"a crop to {keep} leaves none of {len(points)} points: all are alike")
+    return kept
+
+
+def random_motion(angle: float, translation: float, rng: Rng) -> Float32[np.ndarray, "4 4"]:
+    """R = Rx Ry Rz with each angle in [0, angle] degrees, then a translation within a cube."""
+    x, y, z = (rng.uniform() * np.pi * angle / 180.0 for _ in range(3))
+    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
+    about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
+    about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
+    motion = np.eye(4)
+    motion[:3, :3] = about_x @ about_y @ about_z
+    motion[:3, 3] = rng.uniform(-translation, translation, 3)
+    return motion.astype(np.float32)
+
+
+def resample(size: int, count: int, rng: Rng) -> Int[np.ndarray, " count"]:
+    """`count` of `size` rows, none twice; if there are too few, all of them and some again."""
+    if count <= size:
+        return rng.choice(size, count, replace=False)
+    return np.concatenate(
+        [rng.choice(size, size, replace=False), rng.choice(size, count - size, replace=True)]
+    )
+
+
+def jitter(points: Float32[np.ndarray, "n 3"], rng: Rng) -> Float32[np.ndarray, "n 3"]:
+    """Points with clipped Gaussian noise; normals are left exact by all protocols."""
+    drawn = rng.normal(0.0, NOISE_SCALE, points.shape)
+    return (points + np.clip(drawn, -NOISE_CLIP, NOISE_CLIP)).astype(np.float32)
+
+
+def _make_pair(
+    name: str,
+    points: Float32[np.ndarray, "p 3"],
+    normals: Float32[np.ndarray, "p 3"],
+    protocol: Protocol,
+    reseed: Callable[[], Rng],
+    shared: Callable[[Rng], Int[np.ndarray, " n"]],
+) -> Pair:
+    """The operations in their published order: source first, but the target is shuffled first."""
+    if protocol.keep is None and not protocol.noise:
+        chosen = shared(reseed())
+        points, normals = points[chosen], normals[chosen]
+    source_rows = target_rows = np.arange(len(points))
+    overlap = 1.0
+    count = protocol.points
+    if protocol.keep is not None:
+        rng = reseed()
+        source_rows = crop(points, protocol.keep, rng)
+        target_rows = crop(points, protocol.keep, rng)
+        overlap = len(np.intersect1d(source_rows, target_rows)) / len(source_rows)
+        count = math.ceil(np.float32(protocol.keep) * count)
+
+    rng = reseed()
+    motion = random_motion(protocol.angle, protocol.translation, rng)
+    rotation = motion[:3, :3]
+    moved, moved_normals = points @ rotation.T + motion[:3, 3], normals @ rotation.T
+
+    if protocol.keep is not None or protocol.noise:
+        rng = reseed()
+        source_rows = source_rows[resample(len(source_rows), count, rng)]
+        target_rows = target_rows[resample(len(target_rows), count, rng)]
+    source, target = moved[source_rows], points[target_rows]
+    if protocol.noise:
+        source, target = jitter(source, rng), jitter(target, rng)
+    target_order = rng.permutation(len(target))
+    source_order = rng.permutation(len(source))
+
+    back = np.eye(4, dtype=np.float32)
+    back[:3, :3] = rotation.T
+    back[:3, 3] = -rotation.T @ motion[:3, 3]
+    return Pair(
+        name=name,
+        source=source[source_order],
+        target=target[target_order],
+        source_normals=moved_normals[source_rows][source_order],
+        target_normals=normals[target_rows][target_order],
+        transform=back,
+        overlap=overlap,
+        clean_source=moved,
+        clean_target=points,
+    )
