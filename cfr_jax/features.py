@@ -1,0 +1,79 @@
+"""Raw channels of a point and its neighbors, before anything is learned.
+
+The point-pair feature (Drost et al., 2010) of a point p with normal n and a neighbor q with normal m,
+d = q - p: how d lies to both normals, how the normals lie to each other, and |d|. It does not change
+under rigid motions. Two forms: "dot" (CFR) takes inner products of unit vectors, "angle" (RPM-Net)
+their angles.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int32
+
+PairFeature = Literal["dot", "angle"]
+
+
+def raw_features(
+    points: Float[Array, "n 3"],
+    normals: Float[Array, "n 3"],
+    neighbors: Int32[Array, "n k"],
+    *,
+    ppf: PairFeature = "dot",
+) -> Float[Array, "n k 7"]:
+    """CFR's seven channels: the offset to the neighbor (3), then the point-pair feature (4)."""
+    offset = points[neighbors] - points[:, None]
+    return jnp.concatenate(
+        [offset, pair_feature(offset, normals[:, None], normals[neighbors], ppf=ppf)], axis=-1
+    )
+
+
+def pair_feature(
+    offset: Float[Array, "n k 3"],
+    normals: Float[Array, "n 1 3"],
+    neighbor_normals: Float[Array, "n k 3"],
+    *,
+    ppf: PairFeature,
+) -> Float[Array, "n k 4"]:
+    """Channels (n, d), (m, d), (n, m), |d|, where (a, b) is a dot product or an angle in radians.
+
+    Finite gradients everywhere: where d or a cross product is zero, the derivative used is zero.
+    """
+    length = safe_norm(offset)
+    if ppf == "dot":
+        direction = offset / (length + 1e-6)[..., None]
+        relate = _dot
+    elif ppf == "angle":
+        direction = offset
+        relate = _angle
+    else:
+        raise ValueError(f"ppf: got {ppf!r}, wanted 'dot' or 'angle'")
+    return jnp.stack(
+        [
+            relate(normals, direction),
+            relate(neighbor_normals, direction),
+            relate(normals, neighbor_normals),
+            length,
+        ],
+        axis=-1,
+    )
+
+
+def safe_norm(vectors: Float[Array, "*rows c"]) -> Float[Array, "*rows"]:
+    """Euclidean length along the last axis, its gradient zero instead of NaN at zero."""
+    square = jnp.sum(vectors * vectors, axis=-1)
+    positive = square > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
+
+
+def _dot(a, b):
+    # written out: a matrix product would run at reduced precision on accelerators
+    return jnp.sum(a * b, axis=-1)
+
+
+def _angle(a, b):
+    sine, cosine = safe_norm(jnp.cross(a, b)), _dot(a, b)
+    nowhere = (sine == 0) & (cosine == 0)
+    return jnp.where(nowhere, 0, jnp.arctan2(sine, jnp.where(nowhere, 1, cosine)))
