@@ -1,0 +1,1 @@
+"""Float64 numpy reference answers, written from the published description and nothing of ours."""
