@@ -1,0 +1,81 @@
+"""Triangle meshes, on the way to the points sampled from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int64, Real
+
+from .cloud import PointCloud, checked_points, usable_normals
+
+DEFAULT_SAMPLES = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Vertices (v, 3) and the triangles (t, 3) that index them, counter-clockwise outside."""
+
+    vertices: Real[np.ndarray, "v 3"]
+    triangles: Int64[np.ndarray, "t 3"]
+    name: str
+    normals: Real[np.ndarray, "v 3"] | None = None
+
+    def points(self, samples: int | None, seed: int) -> PointCloud:
+        """The surface as `samples` points, 10,000 if None; the bare vertices if 0."""
+        if samples == 0:
+            normals = None if self.normals is None else usable_normals(self.normals)
+            return PointCloud(self.vertices, normals, self.name)
+        if len(self.triangles) == 0:
+            raise ValueError(
+                f"is a mesh without faces ({len(self.vertices)} vertices), wanted at least one "
+                "face; samples=0 takes the vertices as the cloud"
+            )
+        return self._sample(DEFAULT_SAMPLES if samples is None else samples, seed)
+
+    def _sample(self, count: int, seed: int) -> PointCloud:
+        """Points uniform over the surface's area, each with its triangle's normal."""
+        vertices = checked_points(self.vertices)
+        outside = (self.triangles < 0) | (self.triangles >= len(vertices))
+        if outside.any():
+            triangle, corner = np.argwhere(outside)[0]
+            raise ValueError(
+                f"triangle {triangle} names vertex {self.triangles[triangle, corner]}, "
+                f"wanted 0 to {len(vertices) - 1}"
+            )
+        a, b, c = (vertices[self.triangles[:, corner]] for corner in range(3))
+        ab, ac = b - a, c - a
+        cross = np.cross(ab, ac)
+        cumulative = np.cumsum(np.sqrt(np.einsum("ij,ij->i", cross, cross)))
+        if not cumulative[-1] > 0:
+            raise ValueError(f"all {len(cross)} triangles have no area, wanted a surface")
+
+        generator = np.random.default_rng(seed)
+        # side="right" never picks a triangle of zero area: its bound equals the one before.
+        draw = generator.uniform(0.0, cumulative[-1], count)
+        chosen = np.searchsorted(cumulative, draw, side="right")
+        u, v = generator.uniform(size=(2, count, 1))
+        folded = u + v > 1.0  # the far half of the parallelogram, turned back into the triangle
+        u, v = np.where(folded, 1.0 - u, u), np.where(folded, 1.0 - v, v)
+        return PointCloud(a[chosen] + u * ab[chosen] + v * ac[chosen], cross[chosen], self.name)
+
+
+def fan_triangles(
+    values: Real[np.ndarray, " k"], starts: Int64[np.ndarray, " f"], sizes: Int64[np.ndarray, " f"]
+) -> Int64[np.ndarray, "t 3"]:
+    """Polygons cut into triangles about their first corner.
+
+    Polygon i is `values[starts[i] : starts[i] + sizes[i]]`. Polygons of fewer than three
+    corners enclose nothing and give no triangle.
+    """
+    counts = np.maximum(sizes - 2, 0)
+    firsts = np.repeat(starts, counts)
+    # The running number of a triangle within its polygon.
+    within = np.arange(len(firsts)) - np.repeat(np.cumsum(counts) - counts, counts)
+    corners = values[firsts[:, None] + np.stack([0 * within, within + 1, within + 2], axis=1)]
+    # Text may hold anything; beyond 2^53 a float64 is no index, and NaN compares false.
+    whole = ((np.abs(corners) < 2**53) & (corners % 1 == 0)).all(axis=1)
+    if not whole.all():
+        row = int(np.argmin(whole))
+        raise ValueError(f"triangle {row} names vertices {corners[row]}, wanted integers")
+    return corners.astype(np.int64)

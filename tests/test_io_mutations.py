@@ -1,0 +1,141 @@
+"""Damaged files of every format: they are read, or refused by `CloudFileError`, fast and small.
+
+The reading is done by a process of its own, whose peak of memory is then the readers' and whose
+death, should compiled code bring it about, is a failure of the test and not its end.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from pathlib import Path
+
+from io_samples import write_clouds, write_meshes
+
+CASES = 2000
+SECONDS = 1.0
+BYTES = 64 << 20
+BYTES_PER_BYTE = 4
+_ADDRESS_SPACE = 8 << 30  # ends a runaway allocation before it takes the machine
+
+
+def mutate(data: bytes, generator: random.Random) -> bytes:
+    """One to three damages, more of them in the first bytes, where headers are."""
+    damaged = bytearray(data)
+    for _ in range(generator.choice((1, 1, 1, 2, 3))):
+        size = len(damaged)
+        reach = generator.choice((size, size, min(size, 400)))
+        at = generator.randrange(reach) if reach else 0
+        kind = generator.choice(
+            ("flip", "flip", "cut", "insert", "swap", "repeat", "digit", "digit", "word", "extreme")
+        )
+        if size < 16 or kind == "cut":
+            del damaged[at:]
+        elif kind == "flip":
+            damaged[at] ^= 1 << generator.randrange(8)
+        elif kind == "insert":
+            damaged[at:at] = generator.randbytes(generator.choice((1, 2, 4, 100)))
+        elif kind == "swap":
+            other = generator.randrange(size)
+            damaged[at], damaged[other] = damaged[other], damaged[at]
+        elif kind == "repeat":
+            length = generator.choice((1, 8, 64, 512))
+            damaged[at:at] = damaged[at : at + length] * generator.choice((1, 3))
+        elif kind == "digit":
+            digits = [match.start() for match in re.finditer(rb"[0-9]", damaged)]
+            headers = [digit for digit in digits if digit < 400]
+            if digits:
+                where = generator.choice(headers if headers and at < 400 else digits)
+                damaged[where : where + 1] = generator.choice(
+                    (b"9", b"0", b"-1", b"99999999", b"1e300", b"nan", b"", b"x")
+                )
+        elif kind == "word":
+            length = generator.choice((2, 4, 8))
+            value = generator.choice((0, 1, 2 ** (8 * length - 1), 2 ** (8 * length) - 1))
+            damaged[at : at + length] = value.to_bytes(length, "little")
+        else:  # counts and lengths just beyond what is there
+            damaged[at : at + 4] = (generator.choice((size, 50_000, 1 << 24))).to_bytes(4, "little")
+    return bytes(damaged)
+
+
+def run_cases(cases: int, seed: int) -> dict:
+    """Reads that many damaged files, and tells what was wrong about how that went."""
+    from cfr_jax.io import CloudFileError, read
+
+    warnings.simplefilter("error")
+    failures: list[str] = []
+    refused = 0
+    slowest, largest = 0.0, 0
+    messages: set[str] = set()
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        files = {**write_clouds(place), **write_meshes(place)}
+        originals = {name: path.read_bytes() for name, path in sorted(files.items())}
+        for path in files.values():  # what is loaded only once is no cost of a case
+            read(path)
+        names = sorted(originals)
+        resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_SPACE, _ADDRESS_SPACE))
+        for case in range(cases):
+            name = names[case % len(names)]
+            data = mutate(originals[name], random.Random(f"{seed} {case}"))
+            path = place / f"case{Path(name).suffix}"
+            path.write_bytes(data)
+            before = _reset_peak()
+            start = time.perf_counter()
+            try:
+                read(path)
+            except CloudFileError as error:
+                refused += 1
+                messages.add(str(error))
+                if str(path) not in str(error):
+                    failures.append(f"case {case} of {name}: unnamed: {error}")
+            except BaseException as error:
+                failures.append(f"case {case} of {name}: {type(error).__name__}: {error}")
+            seconds = time.perf_counter() - start
+            grown = _memory("VmHWM") - before
+            if seconds > SECONDS:
+                failures.append(f"case {case} of {name}: took {seconds:.1f} s")
+            if grown > BYTES + BYTES_PER_BYTE * len(data):
+                failures.append(f"case {case} of {name}: took {grown >> 20} MiB")
+            slowest, largest = max(slowest, seconds), max(largest, grown)
+    return {
+        "failures": failures, "refused": refused, "messages": len(messages), "slowest": slowest,
+        "largest": largest, "cases": cases,
+    }  # fmt: skip
+
+
+def _reset_peak() -> int:
+    """Forgets the largest memory so far (Linux), and tells the present one in bytes."""
+    Path("/proc/self/clear_refs").write_text("5")
+    return _memory("VmRSS")
+
+
+def _memory(key: str) -> int:
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.split(f"{key}:")[1].split()[0])
+
+
+def test_damaged_files_are_read_or_refused_within_a_second_and_little_memory():
+    # given
+    command = [sys.executable, __file__, str(CASES), "0"]
+
+    # when
+    child = subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+    # then
+    assert child.returncode == 0, child.stderr[-2000:]
+    outcome = json.loads(child.stdout)
+    assert outcome["failures"] == []
+    assert outcome["cases"] == CASES
+    assert CASES // 4 < outcome["refused"] < CASES  # the damage was neither nothing nor all
+
+
+if __name__ == "__main__":
+    print(json.dumps(run_cases(int(sys.argv[1]), int(sys.argv[2]))))
