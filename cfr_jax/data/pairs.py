@@ -1,11 +1,26 @@
-"""A pair of clouds to register, and the files that hold such pairs."""
+"""A pair of clouds to register, and the files that hold many of them.
+
+`open_pairs` reads two forms, and both give the same `Pair`, one at a time and only when asked for:
+
+    CSV   a line a pair: the files of source and target, which may be anything `cfr_jax.io` reads,
+          relative to the folder of the list, then perhaps 16 numbers, the true motion row by row.
+          Passed over: a first line `source,target,...`, empty lines, lines that start with #.
+    HDF5  a group a pair with `source` (N, 3), `target` (M, 3), and perhaps `source_normals`,
+          `target_normals`, `transform` (4, 4), and a number `overlap`.
+"""
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import h5py
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
+
+RIGID_TOLERANCE = 1e-3  # of a written rotation, whose numbers may have three digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,11 +33,159 @@ class Pair:
     """
 
     name: str
-    source: Float32[np.ndarray, "n 3"]
-    target: Float32[np.ndarray, "m 3"]
-    source_normals: Float32[np.ndarray, "n 3"] | None = None
-    target_normals: Float32[np.ndarray, "m 3"] | None = None
+    source: Float[np.ndarray, "n 3"]
+    target: Float[np.ndarray, "m 3"]
+    source_normals: Float[np.ndarray, "n 3"] | None = None
+    target_normals: Float[np.ndarray, "m 3"] | None = None
     transform: Float[np.ndarray, "4 4"] | None = None
     overlap: float | None = None
-    clean_source: Float32[np.ndarray, "p 3"] | None = None
-    clean_target: Float32[np.ndarray, "p 3"] | None = None
+    clean_source: Float[np.ndarray, "p 3"] | None = None
+    clean_target: Float[np.ndarray, "p 3"] | None = None
+
+
+def open_pairs(path: str | Path) -> PairFile:
+    """The pairs of a CSV list or of an HDF5 file; raises ValueError where there are none."""
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"no list of pairs at {path}")
+    return Hdf5Pairs(path) if h5py.is_hdf5(path) else CsvPairs(path)
+
+
+class PairFile(Sequence[Pair]):
+    """Pairs of a file in its order; `names` tells them apart without reading any cloud."""
+
+    path: Path
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> Pair:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"{self.path} holds {len(self)} pairs, asked for number {index}")
+        return self._read(range(len(self))[index])
+
+    def _read(self, index: int) -> Pair:
+        raise NotImplementedError
+
+
+class CsvPairs(PairFile):
+    """A list of pairs; the list is checked when it is opened, each cloud when it is read."""
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        self._rows: list[tuple[str, str, np.ndarray | None]] = []
+        try:
+            with open(self.path, newline="", encoding="utf-8-sig") as file:
+                reader = csv.reader(file)
+                for cells in reader:
+                    row = _parse_row([cell.strip() for cell in cells], self.path, reader.line_num)
+                    if row:
+                        self._rows.append(row)
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(f"{self.path} is neither CSV nor HDF5 ({error})") from error
+        if not self._rows:
+            raise ValueError(f"{self.path} lists no pair; wanted lines of `source,target`")
+        self.names = tuple(f"{source} -> {target}" for source, target, _ in self._rows)
+
+    def _read(self, index: int) -> Pair:
+        from cfr_jax.io import read  # reading formats pulls in what a mere list does not need
+
+        source_file, target_file, transform = self._rows[index]
+        source = read(self.path.parent / source_file)
+        target = read(self.path.parent / target_file)
+        return Pair(
+            name=self.names[index],
+            source=source.points,
+            target=target.points,
+            source_normals=source.normals,
+            target_normals=target.normals,
+            transform=transform,
+        )
+
+
+class Hdf5Pairs(PairFile):
+    """Groups of an HDF5 file, in the order of their names."""
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        try:
+            with h5py.File(self.path, "r") as file:
+                self.names = tuple(sorted(k for k, v in file.items() if isinstance(v, h5py.Group)))
+        except OSError as error:
+            raise ValueError(f"{self.path} is not an HDF5 file ({error})") from error
+        if not self.names:
+            raise ValueError(f"{self.path} holds no group; wanted one a pair: source, target, ...")
+
+    def _read(self, index: int) -> Pair:
+        name = self.names[index]
+        where = f"{self.path}, {name}"
+        with h5py.File(self.path, "r") as file:
+            held = {key: np.asarray(value) for key, value in file[name].items()}
+        missing = [key for key in ("source", "target") if key not in held]
+        if missing:
+            raise ValueError(f"{where} lacks {missing}, it holds {sorted(held)}")
+        for key in ("source", "target", "source_normals", "target_normals"):
+            if key in held:
+                held[key] = _checked_rows(
+                    held[key], like=held[key.split("_")[0]], where=where, key=key
+                )
+        return Pair(
+            name=name,
+            source=held["source"],
+            target=held["target"],
+            source_normals=held.get("source_normals"),
+            target_normals=held.get("target_normals"),
+            transform=checked_motion(held["transform"], where) if "transform" in held else None,
+            overlap=float(held["overlap"]) if "overlap" in held else None,
+        )
+
+
+def checked_motion(values: np.ndarray, where: str) -> Float[np.ndarray, "4 4"]:
+    """A (4, 4) rigid motion in float64, or a ValueError that says `where` it is not one."""
+    motion = np.asarray(values, np.float64)
+    if motion.shape != (4, 4) or not np.isfinite(motion).all():
+        raise ValueError(f"{where}: transform is {motion.shape}, wanted (4, 4) finite numbers")
+    rotation = motion[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or (motion[3] != [0, 0, 0, 1]).any():
+        raise ValueError(
+            f"{where}: transform is not rigid (R Rᵀ is {off:.2g} off the identity, "
+            f"det R = {np.linalg.det(rotation):.3g}, last row {motion[3].tolist()})"
+        )
+    return motion
+
+
+def _parse_row(
+    cells: list[str], path: Path, line: int
+) -> tuple[str, str, Float[np.ndarray, "4 4"] | None] | None:
+    """Source, target and truth of a line, or None where the line is not a pair."""
+    header = line == 1 and [cell.lower() for cell in cells[:2]] == ["source", "target"]
+    if header or not any(cells) or cells[0].startswith("#"):
+        return None
+    source, target, *numbers = [*cells, ""][:2] + cells[2:]
+    where = f"{path}, line {line}"
+    if not source or not target:
+        raise ValueError(f"{where}: wanted `source,target`, got {','.join(cells)!r}")
+    if not any(numbers):
+        return source, target, None
+    try:
+        values = np.array([float(number) for number in numbers])
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}; wanted 16 numbers after the two files") from error
+    if len(values) != 16:
+        raise ValueError(f"{where}: {len(values)} numbers after the two files, wanted 16 or none")
+    return source, target, checked_motion(values.reshape(4, 4), where)
+
+
+def _checked_rows(
+    values: np.ndarray, like: np.ndarray, where: str, key: str
+) -> Float[np.ndarray, "n 3"]:
+    wanted = (len(like), 3) if like.ndim else (0, 3)
+    if values.shape != wanted or not len(values) or values.dtype.kind not in "fiu":
+        raise ValueError(f"{where}: {key} is {values.dtype} {values.shape}, wanted numbers (N, 3)")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{where}: {key} holds numbers that are not finite")
+    return (
+        values if values.dtype.itemsize > 2 and values.dtype.kind == "f" else values.astype(float)
+    )

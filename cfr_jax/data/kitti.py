@@ -1,0 +1,221 @@
+"""Pairs of LiDAR scans from the KITTI odometry benchmark (Geiger et al., 2012).
+
+The folder is laid out as the benchmark's downloads unpack:
+
+    sequences/NN/velodyne/000000.bin ...  float32 x, y, z, reflectance; meters around the sensor
+    sequences/NN/calib.txt                a line `Tr:` with the motion from LiDAR to camera
+    poses/NN.txt                          a line per frame: the motion from camera to first camera
+
+Pairs follow the published procedure: a frame and the first later one more than 10 m away, the
+recorded motion refined by point-to-plane ICP, and only pairs kept that the refinement confirms.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+from tqdm import tqdm
+
+from cfr_jax.data.pairs import Pair
+from cfr_jax.data.protocol import random_motion, resample
+from cfr_jax.data.scans import estimate_normals, refine_point_to_plane, voxel_mean
+
+VOXEL = 0.3  # m
+NORMAL_RADIUS = 3.0  # m
+ICP_THRESHOLD = 1.0  # m
+MIN_FITNESS = 0.65
+LAYOUT = (
+    "The folder holds sequences/NN/velodyne/*.bin, sequences/NN/calib.txt and poses/NN.txt; get "
+    "`velodyne laser data`, `calibration files` and `ground truth poses` of the odometry benchmark "
+    "at https://www.cvlibs.net/datasets/kitti/eval_odometry.php."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPairs:
+    """Pairs of frames of one sequence with their refined truth.
+
+    `frames[p]` is (source, target), the earlier frame being the source; `transforms[p]` maps source
+    onto target, each in the frame of its LiDAR; `fitness[p]` is the share of the source within
+    1 m of the target under it.
+    """
+
+    folder: Path
+    sequence: str
+    frames: Int[np.ndarray, "p 2"]
+    transforms: Float[np.ndarray, "p 4 4"]
+    fitness: Float[np.ndarray, " p"]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+
+def scan_pair(
+    scans: ScanPairs, index: int, points: int = 4000, angle: float = 45.0, translation: float = 15.0
+) -> Pair:
+    """Pair `index`, its source moved at random, both clouds thinned to 0.3 m and then to `points`.
+
+    Always the same for the same index, as in `fixed_pair`. A cloud that has fewer points repeats
+    some.
+    """
+    if not 0 <= index < len(scans):
+        raise ValueError(f"index is {index}, wanted 0 to {len(scans) - 1}")
+    rng = np.random.RandomState(index)
+    motion = random_motion(angle, translation, rng).astype(np.float64)
+    clouds = []
+    for frame in scans.frames[index]:
+        thinned = read_frame(scans.folder, scans.sequence, int(frame))
+        normals = estimate_normals(thinned, NORMAL_RADIUS)
+        chosen = resample(len(thinned), points, rng)
+        clouds.append((thinned[chosen], normals[chosen]))
+    (source, source_normals), (target, target_normals) = clouds
+    source_frame, target_frame = scans.frames[index]
+    return Pair(
+        name=f"{scans.sequence}/{source_frame:06d}-{target_frame:06d}",
+        source=(source @ motion[:3, :3].T + motion[:3, 3]).astype(np.float32),
+        target=target,
+        source_normals=(source_normals @ motion[:3, :3].T).astype(np.float32),
+        target_normals=target_normals,
+        transform=scans.transforms[index] @ np.linalg.inv(motion),
+        overlap=float(scans.fitness[index]),
+    )
+
+
+def read_pairs(
+    folder: str | Path,
+    sequence: str,
+    cache: str | Path | None = None,
+    distance: float = 10.0,
+    stride: int | None = None,
+) -> ScanPairs:
+    """The pairs of a sequence. `cache` keeps the refinement, which takes a second for a full scan.
+
+    `cache` is an .npz file, written when it is not there and used when it was written for the same
+    sequence, poses and settings. `distance` and `stride` are those of `select_frames`. Raises ValueError
+    where the sequence is not there or not as it should be.
+    """
+    folder = Path(folder)
+    poses = read_poses(folder, sequence)
+    frames = select_frames(poses, distance, stride)
+    settings = json.dumps([sequence, VOXEL, NORMAL_RADIUS, ICP_THRESHOLD, frames.tolist()])
+    made_for = hashlib.sha256(settings.encode() + poses.tobytes()).hexdigest()
+    kept = _load(Path(cache), made_for) if cache is not None else None
+    if kept is None:
+        kept = _refine(folder, sequence, poses, frames)
+        if cache is not None:
+            _save(Path(cache), made_for, *kept)
+    transforms, fitness = kept
+    good = fitness > MIN_FITNESS
+    return ScanPairs(folder, sequence, frames[good], transforms[good], fitness[good])
+
+
+def select_frames(
+    poses: Float[np.ndarray, "f 4 4"], distance: float = 10.0, stride: int | None = None
+) -> Int[np.ndarray, "p 2"]:
+    """A frame and the first later one more than `distance` meters away, again and again.
+
+    As published, the next pair starts after the last one ended; with a `stride` it starts so many
+    frames after the last one started, which gives more pairs that share frames.
+    """
+    if stride is not None and stride < 1:
+        raise ValueError(f"stride is {stride}, wanted None or at least 1 frame")
+    places = poses[:, :3, 3]
+    pairs, start = [], 0
+    while start < len(places):
+        far = np.flatnonzero(np.linalg.norm(places[start:] - places[start], axis=1) > distance)
+        if not len(far):
+            break
+        pairs.append((start, start + far[0]))
+        start = start + (stride or far[0] + 1)
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+def read_poses(folder: str | Path, sequence: str) -> Float[np.ndarray, "f 4 4"]:
+    """Per frame the motion from its LiDAR frame to that of the first frame."""
+    folder = Path(folder)
+    rows = _numbers(folder / "poses" / f"{sequence}.txt", "12 numbers a line", str.split)
+    calibration = _numbers(
+        folder / "sequences" / sequence / "calib.txt",
+        "a line `Tr:` with 12 numbers",
+        lambda line: line.split()[1:] if line.startswith("Tr:") else [],
+    )
+    to_camera = _motions(calibration)[0]
+    return np.linalg.inv(to_camera) @ _motions(rows) @ to_camera
+
+
+def read_frame(
+    folder: str | Path, sequence: str, frame: int, voxel: float = VOXEL
+) -> Float32[np.ndarray, "n 3"]:
+    """The points of one scan in meters, one per voxel; a voxel of 0 leaves the scan as it is."""
+    path = Path(folder) / "sequences" / sequence / "velodyne" / f"{frame:06d}.bin"
+    if not path.is_file():
+        raise ValueError(f"no scan at {path}. {LAYOUT}")
+    values = np.fromfile(path, np.float32)
+    if not len(values) or len(values) % 4 or not np.isfinite(values).all():
+        raise ValueError(f"{path} is not a scan: wanted finite float32 x, y, z, reflectance")
+    points = values.reshape(-1, 4)[:, :3]
+    return voxel_mean(points, voxel) if voxel else points
+
+
+def _refine(
+    folder: Path, sequence: str, poses: np.ndarray, frames: np.ndarray
+) -> tuple[Float[np.ndarray, "p 4 4"], Float[np.ndarray, " p"]]:
+    transforms, fitness = np.empty((len(frames), 4, 4)), np.empty(len(frames))
+    for row, (source, target) in enumerate(tqdm(frames, f"KITTI {sequence}", disable=None)):
+        cloud = read_frame(folder, sequence, int(target))
+        transforms[row], fitness[row] = refine_point_to_plane(
+            read_frame(folder, sequence, int(source)),
+            cloud,
+            estimate_normals(cloud, NORMAL_RADIUS),
+            np.linalg.inv(poses[target]) @ poses[source],
+            ICP_THRESHOLD,
+        )
+    return transforms, fitness
+
+
+def _numbers(
+    path: Path, wanted: str, parts: Callable[[str], list[str]]
+) -> Float[np.ndarray, "n 12"]:
+    if not path.is_file():
+        raise ValueError(f"no {path}. {LAYOUT}")
+    rows = [parts(line) for line in path.read_text().splitlines()]
+    try:
+        values = np.array([[float(x) for x in row] for row in rows if row])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; wanted {wanted}") from error
+    if values.ndim != 2 or values.shape[1] != 12 or not np.isfinite(values).all():
+        raise ValueError(f"{path} is not as it should be; wanted {wanted}")
+    return values
+
+
+def _motions(rows: Float[np.ndarray, "n 12"]) -> Float[np.ndarray, "n 4 4"]:
+    motions = np.tile(np.eye(4), (len(rows), 1, 1))
+    motions[:, :3] = rows.reshape(-1, 3, 4)
+    return motions
+
+
+def _load(path: Path, made_for: str) -> tuple[np.ndarray, np.ndarray] | None:
+    if not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            same = str(held["made_for"]) == made_for
+            return (held["transforms"], held["fitness"]) if same else None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"cache {path} cannot be read ({error}); remove it") from error
+
+
+def _save(path: Path, made_for: str, transforms: np.ndarray, fitness: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    with open(beside, "wb") as file:
+        np.savez(file, made_for=made_for, transforms=transforms, fitness=fitness)
+    os.replace(beside, path)
