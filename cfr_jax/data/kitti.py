@@ -99,8 +99,8 @@ def read_pairs(
     """The pairs of a sequence. `cache` keeps the refinement, which takes a second for a full scan.
 
     `cache` is an .npz file, written when it is not there and used when it was written for the same
-    sequence, poses and settings. `distance` and `stride` are those of `select_frames`. Raises ValueError
-    where the sequence is not there or not as it should be.
+    sequence, poses and settings. `distance` and `stride` are those of `select_frames`. Raises
+    ValueError where the sequence is not there or not as it should be.
     """
     folder = Path(folder)
     poses = read_poses(folder, sequence)
