@@ -15,11 +15,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from cfr_jax.eigen import symmetric_eigen
+
 _HIGHEST = lax.Precision.HIGHEST
-# Jacobi converges quadratically; measured on 1e6 random, rank-deficient and repeated-eigenvalue
-# matrices, the fifth sweep no longer changes a float32 result.
-_SWEEPS = 5
-_DISJOINT_PLANES = (((0, 1), (2, 3)), ((0, 2), (1, 3)), ((0, 3), (1, 2)))
 
 
 def from_parts(rotation: Float[Array, "3 3"], translation: Float[Array, " 3"]) -> Float[Array, "4 4"]:
@@ -104,7 +102,7 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
             [yx - xy, xz + zx, yz + zy, zz - xx - yy],
         ]
     )
-    values, vectors = _symmetric_eigen(horn)
+    values, vectors = symmetric_eigen(horn)
     return from_quaternion(vectors[:, jnp.argmax(values)])
 
 
@@ -117,45 +115,13 @@ def _nearest_rotation_jvp(primals, tangents):
     system = jnp.trace(stretch) * jnp.eye(3, dtype=matrix.dtype) - stretch
     largest = jnp.max(jnp.abs(system))
     scale = jnp.where(largest > 0, largest, 1)
-    values, vectors = _symmetric_eigen(lax.stop_gradient(system / scale))
+    values, vectors = symmetric_eigen(lax.stop_gradient(system / scale))
     determined = values > 1e-5
     inverse = jnp.where(determined, 1 / jnp.where(determined, values, 1), 0)
     change = jnp.matmul(rotation.T, tangent / scale, precision=_HIGHEST)
     axial = _vee(change - change.T)
     turn = jnp.matmul(vectors, inverse * jnp.matmul(vectors.T, axial, precision=_HIGHEST))
     return rotation, jnp.matmul(rotation, skew(turn), precision=_HIGHEST)
-
-
-def _symmetric_eigen(matrix):
-    """Eigenvalues and eigenvectors (columns) by cyclic Jacobi, for the 3x3 and 4x4 of this file.
-
-    `jnp.linalg.eigh` calls out to a solver made for large matrices: on GPUs a batch of 3x3 takes
-    longer there than the whole network. Two disjoint planes are turned at a time.
-    """
-    n = matrix.shape[0]
-    rounds = [[p for p in planes if max(p) < n] for planes in _DISJOINT_PLANES]
-
-    def sweep(_, state):
-        matrix, vectors = state
-        for planes in rounds:
-            turn = jnp.eye(n, dtype=matrix.dtype)
-            for p, q in planes:
-                off, gap = matrix[p, q], matrix[q, q] - matrix[p, p]
-                # tan(2 angle) = 2 off / gap, solved for the smaller angle without a branch on signs
-                tangent = 2 * off * jnp.where(gap < 0, -1, 1)
-                reach = jnp.abs(gap) + jnp.sqrt(gap * gap + 4 * off * off)
-                tangent = tangent / jnp.where(reach > 0, reach, 1)
-                cos = lax.rsqrt(1 + tangent * tangent)
-                sin = tangent * cos
-                turn = turn.at[p, p].set(cos).at[q, q].set(cos).at[p, q].set(sin).at[q, p].set(-sin)
-            matrix = jnp.matmul(
-                turn.T, jnp.matmul(matrix, turn, precision=_HIGHEST), precision=_HIGHEST
-            )
-            vectors = jnp.matmul(vectors, turn, precision=_HIGHEST)
-        return matrix, vectors
-
-    matrix, vectors = lax.fori_loop(0, _SWEEPS, sweep, (matrix, jnp.eye(n, dtype=matrix.dtype)))
-    return jnp.diagonal(matrix), vectors
 
 
 def from_quaternion(quaternion: Float[Array, " 4"]) -> Float[Array, "3 3"]:

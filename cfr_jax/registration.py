@@ -1,0 +1,226 @@
+"""`register`: two clouds in, the rigid motion of each iteration out.
+
+A pure function of arrays: it jits, vmaps, and differentiates with respect to parameters and clouds.
+Clouds are expected about the size of the unit sphere, where the network was trained; `align` brings
+any pair there and back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int32
+
+from cfr_jax import neighbors as knn
+from cfr_jax import rigid
+from cfr_jax.features import PairFeature, raw_features
+from cfr_jax.network import CFR
+from cfr_jax.normals import estimate_normals
+from cfr_jax.sinkhorn import Match, match
+
+_HIGHEST = lax.Precision.HIGHEST
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What changes the compiled program. The defaults are the paper's."""
+
+    neighbors: int = 64
+    radius: float = 0.3
+    """Neighbors further away are replaced by the nearest one; in units of the unit sphere."""
+    ppf: PairFeature = "dot"
+    detach_motion: bool = False
+    """Stop gradients at the motion between iterations, as the paper trains."""
+
+
+@struct.dataclass
+class Cloud:
+    """A cloud ready for the network: normals and neighbors known; `mask` marks valid rows."""
+
+    points: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+    neighbors: Int32[Array, "n k"]
+    mask: Bool[Array, " n"] | None = None
+
+
+@struct.dataclass
+class Encoded:
+    """The reference side of a registration, computed once for any number of sources."""
+
+    cloud: Cloud
+    features: Float[Array, "L m d"]
+
+
+@struct.dataclass
+class Registration:
+    """Answer of `register`."""
+
+    transforms: Float[Array, "L 4 4"]
+    """One motion per iteration, each from the source as given onto the target."""
+    weights: Float[Array, " n"]
+    """How much of each source point found a partner in the last match, in [0, 1]."""
+    covered: Float[Array, " m"]
+    """The same for each target point."""
+    targets: Float[Array, "n 3"]
+    """Where the last match puts each source point."""
+    beta: Float[Array, " L"]
+    """Annealing: how sharp the match of each iteration was."""
+    alpha: Float[Array, " L"]
+    """Annealing: how far in feature space it reached."""
+
+    @property
+    def transform(self) -> Float[Array, "4 4"]:
+        """The last motion; maps source onto target."""
+        return self.transforms[-1]
+
+
+def prepare(
+    points: Float[Array, "n c"],
+    *,
+    mask: Bool[Array, " n"] | None = None,
+    neighbors: Int32[Array, "n k"] | None = None,
+    settings: Settings = Settings(),
+) -> Cloud:
+    """A `Cloud` from raw points (n, 3), or points and normals (n, 6).
+
+    Missing normals are estimated (`normals.estimate_normals`); missing neighbors are searched on the
+    device. Fewer than K + 1 points have fewer neighbors each. Raises ValueError on wrong shapes.
+    """
+    if points.ndim != 2 or points.shape[1] not in (3, 6):
+        raise ValueError(
+            f"points: got shape {points.shape}, wanted (n, 3) points or (n, 6) points and normals"
+        )
+    if points.shape[0] < 3:
+        raise ValueError(f"points: got {points.shape[0]} points, wanted at least 3")
+    points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
+    normals = points[:, 3:] if points.shape[1] == 6 else None
+    points = points[:, :3]
+    if mask is not None:
+        points = jnp.where(mask[:, None], points, 0)
+    if neighbors is None:
+        k = min(settings.neighbors, points.shape[0] - 1)
+        neighbors = knn.nearest(lax.stop_gradient(points), k, radius=settings.radius, mask=mask)
+    if normals is None:
+        normals = estimate_normals(points, neighbors, mask)
+    elif mask is not None:
+        normals = jnp.where(mask[:, None], normals, 0)
+    return Cloud(points, normals, neighbors, mask)
+
+
+def encode(
+    params: dict, target: Float[Array, "m c"] | Cloud, *, settings: Settings = Settings()
+) -> Encoded:
+    """The features of a reference in every iteration; hand it to `register` as the target."""
+    cloud = target if isinstance(target, Cloud) else prepare(target, settings=settings)
+    network = bind(params)
+    features = network.cascade.at_rest(
+        _heavy_features(network, cloud, settings), cloud.points, cloud.mask
+    )
+    return Encoded(cloud, features)
+
+
+@functools.partial(jax.jit, static_argnames=("iterations", "settings"))
+def register(
+    params: dict,
+    source: Float[Array, "n c"] | Cloud,
+    target: Float[Array, "m c"] | Cloud | Encoded,
+    *,
+    iterations: int | None = None,
+    settings: Settings = Settings(),
+) -> Registration:
+    """Registers `source` onto `target`: `transform @ [x; 1]` lies on the target.
+
+    Clouds are raw arrays, (n, 3) or with normals (n, 6), or prepared (`prepare`, for masks and
+    neighbors of your own); a target may be encoded beforehand. Iteration i runs i Sinkhorn passes.
+    `iterations` may be anything from 1; beyond the L of the parameters, the last layer is repeated
+    on the features it was trained to receive, with its own annealing and L passes: the cloud moves
+    on, the features only follow its position. Differentiates through everything but the choice of
+    neighbors. Raises ValueError on wrong shapes.
+    """
+    iterations = iterations_of(params) if iterations is None else iterations
+    if iterations < 1:
+        raise ValueError(f"iterations: got {iterations}, wanted at least 1")
+    source = source if isinstance(source, Cloud) else prepare(source, settings=settings)
+    if not isinstance(target, Encoded):
+        target = encode(params, target, settings=settings)
+    steps = list(iterate(params, source, target, iterations, settings))
+    return Registration(
+        transforms=jnp.stack([step.transform for step in steps]),
+        weights=steps[-1].match.weights,
+        covered=steps[-1].match.covered,
+        targets=steps[-1].match.targets,
+        beta=jnp.stack([step.beta for step in steps]),
+        alpha=jnp.stack([step.alpha for step in steps]),
+    )
+
+
+class Step(NamedTuple):
+    """What one iteration found."""
+
+    transform: Float[Array, "4 4"]
+    match: Match
+    log_affinity: Float[Array, "n m"]
+    beta: Float[Array, ""]
+    alpha: Float[Array, ""]
+
+
+def iterate(
+    params: dict, source: Cloud, target: Encoded, iterations: int, settings: Settings
+) -> Iterator[Step]:
+    """The iterations of `register`, one by one, for those who need what lies between (the loss).
+
+    This is the scan over the parameters stacked on L, written out: iteration i runs i Sinkhorn
+    passes, and in a compiled loop that count could not be static.
+    """
+    network, count = bind(params), iterations_of(params)
+    reference = target.cloud
+    annealing = network.annealing(source.points, reference.points, source.mask, reference.mask)
+    received = features = _heavy_features(network, source, settings)
+    moved = source.points
+    for i in range(iterations):
+        layer = min(i, count - 1)
+        received = features if i == layer else received
+        features = network.cascade.layer(layer, received, moved, source.mask)
+        beta, alpha = annealing.beta[layer], annealing.alpha[layer]
+        affinity = log_affinity(features, target.features[layer], beta, alpha)
+        found = match(
+            affinity,
+            reference.points,
+            passes=layer + 1,
+            source_mask=source.mask,
+            target_mask=reference.mask,
+        )
+        transform = rigid.fit_rigid(source.points, found.targets, found.weights)
+        yield Step(transform, found, affinity, beta, alpha)
+        motion = lax.stop_gradient(transform) if settings.detach_motion else transform
+        moved = rigid.apply(motion, source.points)
+
+
+def log_affinity(
+    source: Float[Array, "n d"], target: Float[Array, "m d"], beta: Array, alpha: Array
+) -> Float[Array, "n m"]:
+    """-beta (|f_x - f_y|^2 - alpha) for unit features."""
+    square = 2 - 2 * jnp.matmul(source, target.T, precision=_HIGHEST)
+    return -beta * (square - alpha)
+
+
+def iterations_of(params: dict) -> int:
+    """L, the number of iterations that the parameters were made for."""
+    return params["cascade"]["kernel"].shape[0]
+
+
+def bind(params: dict) -> CFR:
+    """The network with its parameters inside."""
+    return CFR(iterations_of(params)).bind({"params": params})
+
+
+def _heavy_features(network, cloud, settings):
+    raw = raw_features(cloud.points, cloud.normals, cloud.neighbors, ppf=settings.ppf)
+    return network.features(raw, cloud.mask)

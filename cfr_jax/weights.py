@@ -1,0 +1,116 @@
+"""Weights on disk: safetensors, one array per parameter, named by its path in the tree."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from cfr_jax.network import init_params
+
+SHIPPED = Path(__file__).parent / "models"
+DEFAULT = "object"
+
+
+@dataclasses.dataclass(frozen=True)
+class Weights:
+    """Parameters and where they come from."""
+
+    params: dict
+    name: str
+    sha256: str
+    """Over the tensors and the notes, as written into the file when it was made."""
+    notes: dict[str, str]
+
+
+def save_params(path: str | Path, params: dict, notes: dict[str, str] | None = None) -> None:
+    """Writes parameters and notes about them (strings), beside first and then renamed."""
+    path, notes = Path(path), dict(notes or {})
+    tensors = {name: np.asarray(leaf) for name, leaf in flatten_dict(params, sep="/").items()}
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        save_file(tensors, beside, metadata=notes | {"sha256": _digest(tensors, notes)})
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def load_params(source: str | Path = DEFAULT) -> dict:
+    """Parameters that ship with the package, by name, or of a .safetensors file, by path.
+
+    A pytree of float32 arrays for `register`. Raises ValueError as `read_weights` does.
+    """
+    return read_weights(source).params
+
+
+def shipped() -> tuple[str, ...]:
+    """Names of the weights in the package."""
+    return tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
+
+
+def read_weights(source: str | Path = DEFAULT) -> Weights:
+    """Weights with their name, digest and notes.
+
+    Raises ValueError where there is no such name or file, where the file is not sound (its digest
+    does not fit), and where it does not hold this network.
+    """
+    path = Path(source)
+    if str(source) in shipped():
+        path = SHIPPED / f"{source}.safetensors"
+    if not path.is_file():
+        raise ValueError(
+            f"weights: no file and no shipped weights called {str(source)!r}; "
+            f"shipped are {', '.join(shipped()) or 'none'}"
+        )
+    try:
+        with safe_open(path, framework="numpy") as file:
+            notes = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, OSError, ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"weights: {path} is no readable safetensors file ({error})") from error
+    told = notes.pop("sha256", None)
+    if told is None:
+        raise ValueError(
+            f"weights: {path} carries no digest, so it was not written by cfr_jax; "
+            "the authors' own tensors go through `cfr convert` first"
+        )
+    if told != _digest(tensors, notes):
+        raise ValueError(f"weights: {path} is damaged: its digest does not fit its content")
+    _check_shapes(path, tensors)
+    params = unflatten_dict({name: jnp.asarray(leaf) for name, leaf in tensors.items()}, sep="/")
+    return Weights(params, path.stem, told, notes)
+
+
+def _check_shapes(path, tensors):
+    stacked = tensors.get("cascade/kernel", np.zeros(0))
+    iterations = stacked.shape[0] if stacked.ndim == 3 else 5
+    wanted = jax.eval_shape(functools.partial(init_params, iterations=iterations), jax.random.key(0))
+    wanted = {name: leaf.shape for name, leaf in flatten_dict(wanted, sep="/").items()}
+    found = {name: leaf.shape for name, leaf in tensors.items()}
+    for name in sorted(wanted.keys() | found.keys()):
+        if wanted.get(name) != found.get(name):
+            raise ValueError(
+                f"weights: {path} does not hold a CFR network: {name} is "
+                f"{found.get(name, 'missing')}, wanted {wanted.get(name, 'no such tensor')}"
+            )
+        if tensors[name].dtype != np.float32:
+            raise ValueError(f"weights: {path}: {name} is {tensors[name].dtype}, wanted float32")
+
+
+def _digest(tensors, notes):
+    digest = hashlib.sha256(json.dumps(notes, sort_keys=True).encode())
+    for name in sorted(tensors):
+        array = np.ascontiguousarray(tensors[name])
+        digest.update(f"{name}{array.shape}{array.dtype}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
