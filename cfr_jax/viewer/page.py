@@ -1,0 +1,173 @@
+"""The registration as one HTML page: no network, no dependencies, opens from a file."""
+
+import base64
+import hashlib
+import html
+import json
+import os
+import re
+from importlib import resources
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int, UInt8
+
+from cfr_jax.viewer.atomic import write_atomically
+from cfr_jax.viewer.scene import Scene
+from cfr_jax.viewer.view import View, best_view
+
+INT16 = 32767
+UNUSED = 255  # weight byte of a point the network did not use; used ones are 0 … 254
+
+
+def write_page(path: str | os.PathLike[str], scene: Scene, *, max_points: int = 20_000) -> None:
+    """Writes an interactive page of `scene` to `path`, replacing what was there.
+
+    Clouds with more than `max_points` points are thinned (at random, always the same way; points
+    with a weight are kept first), and coordinates are rounded to 1/65534 of each cloud's extent:
+    the page shows the registration, it does not carry the data. Text from the scene is only ever
+    shown as text.
+
+    Raises ValueError if `max_points` is not a positive integer, OSError if `path` cannot be
+    written.
+    """
+    if isinstance(max_points, bool) or not isinstance(max_points, int) or max_points < 1:
+        raise ValueError(f"max_points: got {max_points!r}, wanted an integer >= 1")
+    template = resources.files("cfr_jax.viewer").joinpath("page.html").read_text("utf-8")
+    fills = {
+        "csp": _content_security_policy(template),
+        "title": _text_for_html(f"{scene.source_name} → {scene.target_name}"),
+        "scene": _json_for_html(_payload(scene, best_view(scene), max_points)),
+    }
+    # One pass: a name that looks like a placeholder is never filled in its turn.
+    page = re.sub(r"\{\{(csp|title|scene)\}\}", lambda match: fills[match[1]], template)
+    write_atomically(path, page.encode())
+
+
+def _content_security_policy(template: str) -> str:
+    """Allows the template's own script and style by their hashes, and nothing else."""
+    allowed = {
+        tag: " ".join(
+            f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+            for text in re.findall(rf"<{tag}>(.*?)</{tag}>", template, flags=re.DOTALL)
+        )
+        for tag in ("script", "style")
+    }
+    return (
+        f"default-src 'none'; script-src {allowed['script']}; style-src {allowed['style']}; "
+        "img-src data:; base-uri 'none'; form-action 'none'"
+    )
+
+
+def _text_for_html(text: str) -> str:
+    """Escaped and plain ASCII: a file name may hold bytes that no encoding can write."""
+    return html.escape(text).encode("ascii", "xmlcharrefreplace").decode("ascii")
+
+
+def _json_for_html(value: dict[str, Any]) -> str:
+    """JSON that cannot end the script element around it, nor open anything inside it."""
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text
+
+
+def _payload(scene: Scene, view: View, max_points: int) -> dict[str, Any]:
+    """What page.html reads; lengths in units of `scale`, positions relative to the view's center.
+
+    Large offsets (map coordinates) are removed here, in float64, so that the page may compute in
+    float32.
+    """
+    scale = float(view.radii[-1])
+    kept_source = _thin(len(scene.source), max_points, scene.weights)
+    kept_target = _thin(len(scene.target), max_points, None)
+    source_center, source = _quantize(scene.source[kept_source], scale)
+    target_center, target = _quantize(scene.target[kept_target], scale)
+    return {
+        "source": {
+            **source,
+            "name": scene.source_name,
+            "total": len(scene.source),
+            "weights": None if scene.weights is None else _weights(scene.weights[kept_source]),
+        },
+        "target": {
+            **target,
+            "name": scene.target_name,
+            "total": len(scene.target),
+            "position": ((target_center - view.center) / scale).tolist(),
+        },
+        "stations": [
+            {
+                "label": label,
+                "matrix": transform.tolist(),
+                "rotation": _quaternion(transform[:3, :3]).tolist(),
+                # Where the middle of the source lies: what moves evenly between two stations,
+                # whatever the distance of the cloud from its origin.
+                "position": (
+                    (transform[:3, :3] @ source_center + transform[:3, 3] - view.center) / scale
+                ).tolist(),
+                "radius": float(radius) / scale,
+            }
+            for label, transform, radius in zip(
+                scene.labels, scene.transforms, view.radii, strict=True
+            )
+        ],
+        "view": _quaternion(view.rotation).tolist(),
+        "facts": list(scene.facts.items()),
+        "warnings": list(scene.warnings),
+    }
+
+
+def _thin(
+    count: int, max_points: int, weights: Float64[np.ndarray, " n"] | None
+) -> Int[np.ndarray, " k"]:
+    """Indices of at most `max_points` points, in order; those with a weight come first."""
+    if count <= max_points:
+        return np.arange(count)
+    order = np.random.default_rng(0).permutation(count)
+    if weights is not None:
+        order = order[np.argsort(np.isnan(weights[order]), kind="stable")]
+    return np.sort(order[:max_points])
+
+
+def _quantize(
+    points: Float64[np.ndarray, "n 3"], scale: float
+) -> tuple[Float64[np.ndarray, " 3"], dict[str, Any]]:
+    """Middle of the points, and their int16 offsets from it: offset · size / 32767 · scale."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    center = (low + high) / 2
+    extent = float((high - low).max()) / 2
+    steps = np.rint((points - center) * (INT16 / extent if extent > 0 else 0.0))
+    return center, {
+        "count": len(points),
+        "size": extent / scale,
+        "points": _base64(steps.astype("<i2")),
+    }
+
+
+def _weights(weights: Float64[np.ndarray, " n"]) -> str:
+    levels = np.rint(np.clip(weights, 0.0, 1.0) * (UNUSED - 1))
+    return _base64(np.where(np.isnan(weights), UNUSED, levels).astype(np.uint8))
+
+
+def _base64(array: Int[np.ndarray, "..."] | UInt8[np.ndarray, "..."]) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
+
+
+def _quaternion(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 4"]:
+    """Unit quaternion x, y, z, w of a rotation, also of one that is orthonormal only roughly.
+
+    The eigenvector of the largest eigenvalue of Bar-Itzhack's symmetric matrix; the sign is the
+    one with w >= 0.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    symmetric = np.array(
+        [
+            [a - e - i, b + d, c + g, h - f],
+            [b + d, e - a - i, f + h, c - g],
+            [c + g, f + h, i - a - e, d - b],
+            [h - f, c - g, d - b, a + e + i],
+        ]
+    )
+    quaternion = np.linalg.eigh(symmetric)[1][:, -1]
+    return quaternion if quaternion[3] >= 0 else -quaternion

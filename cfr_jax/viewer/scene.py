@@ -1,0 +1,135 @@
+"""What a picture of one registration shows: two clouds, the stations of the motion, the facts."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import ArrayLike
+
+# Interpolating between stations needs rotations; float32 results are orthonormal to about 1e-6.
+RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One registration, ready to be drawn; every array is copied to read-only float64.
+
+    `source` (n, 3) and `target` (m, 3) are in the caller's own frames and units. `transforms`
+    (S, 4, 4) are the stations of the motion in order, each mapping the *original* source onto the
+    target (`T @ [x; 1]`): first where the source starts (the identity or the initial transform),
+    then one per iteration, last the answer. `labels` names each station.
+
+    `weights` (n,) is the correspondence weight of each source point, about 0 to 1; NaN marks a
+    point the network did not use, None means no weights are known. `facts` are short label → text
+    pairs shown in their order, `warnings` are sentences shown above them.
+
+    Raises ValueError, naming the argument, for a wrong shape, an empty cloud, a coordinate that is
+    not finite, fewer than two stations, a transform that is not a rigid motion, negative weights,
+    or facts that are not text yet.
+    """
+
+    # Typed as what may be given; what is kept is float64 and tuples.
+    source: ArrayLike
+    target: ArrayLike
+    transforms: ArrayLike
+    labels: Sequence[str]
+    weights: ArrayLike | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    source_name: str = "source"
+    target_name: str = "target"
+    warnings: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        source = _cloud("source", self.source)
+        transforms = _stations(self.transforms)
+        checked = {
+            "source": source,
+            "target": _cloud("target", self.target),
+            "transforms": transforms,
+            "labels": _texts("labels", self.labels),
+            "weights": None if self.weights is None else _weights(self.weights, len(source)),
+            "facts": _facts(self.facts),
+            "warnings": _texts("warnings", self.warnings),
+        }
+        if len(checked["labels"]) != len(transforms):
+            raise ValueError(
+                f"labels: got {len(checked['labels'])} for {len(transforms)} transforms, "
+                "wanted one per transform"
+            )
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    def moved(self, station: int) -> Float64[np.ndarray, "n 3"]:
+        """Source points at one station, in the target's frame."""
+        transform = self.transforms[station]
+        return self.source @ transform[:3, :3].T + transform[:3, 3]
+
+
+def _array(name: str, value: ArrayLike) -> Float64[np.ndarray, "..."]:
+    try:
+        array = np.array(value, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: got {type(value).__name__}, wanted an array of reals") from error
+    array.flags.writeable = False
+    return array
+
+
+def _cloud(name: str, value: ArrayLike) -> Float64[np.ndarray, "n 3"]:
+    cloud = _array(name, value)
+    if cloud.ndim != 2 or cloud.shape[1] != 3 or len(cloud) == 0:
+        raise ValueError(f"{name}: got shape {cloud.shape}, wanted (n, 3) with n >= 1")
+    if not np.isfinite(cloud).all():
+        bad = int((~np.isfinite(cloud).all(axis=1)).sum())
+        raise ValueError(f"{name}: {bad} of {len(cloud)} points are not finite")
+    return cloud
+
+
+def _stations(value: ArrayLike) -> Float64[np.ndarray, "s 4 4"]:
+    transforms = _array("transforms", value)
+    if transforms.ndim != 3 or transforms.shape[1:] != (4, 4) or len(transforms) < 2:
+        raise ValueError(f"transforms: got shape {transforms.shape}, wanted (S, 4, 4) with S >= 2")
+    for index, transform in enumerate(transforms):
+        rotation = transform[:3, :3]
+        # Written so that NaN fails too: a comparison with NaN is false.
+        rigid = (
+            np.isfinite(transform).all()
+            and np.abs(rotation @ rotation.T - np.eye(3)).max() < RIGID_TOLERANCE
+            and np.linalg.det(rotation) > 0
+            and np.abs(transform[3] - (0, 0, 0, 1)).max() < RIGID_TOLERANCE
+        )
+        if not rigid:
+            raise ValueError(
+                f"transforms[{index}]: wanted a rigid motion (a proper rotation, a translation, "
+                f"last row 0 0 0 1), got {transform.tolist()}"
+            )
+    return transforms
+
+
+def _weights(value: ArrayLike, count: int) -> Float64[np.ndarray, " n"]:
+    weights = _array("weights", value)
+    if weights.shape != (count,):
+        raise ValueError(f"weights: got shape {weights.shape}, wanted ({count},), one per source")
+    if (weights < 0).any() or np.isinf(weights).any():
+        raise ValueError(
+            f"weights: got values from {np.nanmin(weights)} to {np.nanmax(weights)}, "
+            "wanted finite weights >= 0 (NaN for a point that was not used)"
+        )
+    return weights
+
+
+def _texts(name: str, value: Sequence[str]) -> tuple[str, ...]:
+    # A lone string is a sequence too, and would silently become one text per letter.
+    if isinstance(value, str):
+        raise ValueError(f"{name}: got the string {value!r}, wanted a sequence of strings")
+    return tuple(value)
+
+
+def _facts(value: Mapping[str, Any]) -> Mapping[str, str]:
+    # How many digits a number deserves is known where it comes from, not here.
+    for name, text in value.items():
+        if not isinstance(text, str):
+            raise ValueError(f"facts[{name!r}]: got {text!r}, wanted text")
+    return MappingProxyType(dict(value))
