@@ -16,8 +16,8 @@ def get_config() -> ConfigDict:
     # Clouds grow as training goes on: small ones learn the most per second at first, and the
     # weights depend neither on the points nor on the neighbors (docs/training.md).
     config.phases = (
-        ConfigDict({"steps": 3000, "points": 256, "neighbors": 24, "batch": 8}),
-        ConfigDict({"steps": 6500, "points": 717, "neighbors": 32, "batch": 8}),
+        {"steps": 3000, "points": 256, "neighbors": 24, "batch": 8},
+        {"steps": 7500, "points": 717, "neighbors": 32, "batch": 8},
     )
 
     config.sampling = ConfigDict()
