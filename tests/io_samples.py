@@ -71,7 +71,7 @@ def write_clouds(folder: Path) -> dict[str, Path]:
 
 
 def table_text(table: np.ndarray, delimiter: str = " ") -> bytes:
-    return "".join(delimiter.join(f"{v:.10g}" for v in row) + "\n" for row in table).encode()
+    return "".join(delimiter.join(f"{v:.17g}" for v in row) + "\n" for row in table).encode()
 
 
 def write_las(path: Path, xyz: np.ndarray, layout: int = 3, version: str = "1.2") -> None:

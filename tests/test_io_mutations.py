@@ -7,6 +7,7 @@ death, should compiled code bring it about, is a failure of the test and not its
 from __future__ import annotations
 
 import json
+import os
 import random
 import re
 import resource
@@ -105,7 +106,11 @@ def run_cases(cases: int, seed: int) -> dict:
             if grown > BYTES + BYTES_PER_BYTE * len(data):
                 failures.append(f"case {case} of {name}: took {grown >> 20} MiB")
             slowest, largest = max(slowest, seconds), max(largest, grown)
+    before = _reset_peak()
+    bytearray(101 << 20)
+    meter = _memory("VmHWM") - before
     return {
+        "meter": meter,
         "failures": failures, "refused": refused, "messages": len(messages), "slowest": slowest,
         "largest": largest, "cases": cases,
     }  # fmt: skip
@@ -125,15 +130,17 @@ def _memory(key: str) -> int:
 def test_damaged_files_are_read_or_refused_within_a_second_and_little_memory():
     # given
     command = [sys.executable, __file__, str(CASES), "0"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
     # when
-    child = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    child = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
 
     # then
     assert child.returncode == 0, child.stderr[-2000:]
     outcome = json.loads(child.stdout)
     assert outcome["failures"] == []
     assert outcome["cases"] == CASES
+    assert outcome["meter"] >= 100 << 20  # the peak of memory is seen where there is one
     assert CASES // 4 < outcome["refused"] < CASES  # the damage was neither nothing nor all
 
 

@@ -13,12 +13,16 @@ import numpy as np
 from .cloud import CloudFileError
 
 _CHUNKED, _LAYERED = 2, 3
-# Compressed layers of each kind of field, by its number: point, color, color with infrared,
-# waveform. The last kind, bytes of one's own, has a layer for each.
+# Kinds of fields, by their numbers. Those of old formats are compressed together, with the bytes
+# they take: point, time, color, waveform. Those of LAS 1.4 are compressed in layers, and have bytes
+# and layers: point, color, color with infrared, waveform. "Extra" bytes are as many as there are,
+# with a layer for each.
+_JOINT_SIZES = {6: 20, 7: 8, 8: 6, 9: 29}
+_LAYERED_SIZES = {10: 30, 11: 6, 12: 8, 13: 29}
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
-_OWN_BYTES = 14
-# The most points per byte we unpack; points all alike take more than a fortieth of a byte each.
-_DENSEST = 64
+_JOINT_EXTRA, _LAYERED_EXTRA = 0, 14
+# The most points per byte we unpack; a million points evenly along a line are 143 to the byte.
+_DENSEST = 256
 
 
 def check_chunks(data: bytes, start: int, count: int, row_size: int, record: bytes) -> None:
@@ -27,10 +31,14 @@ def check_chunks(data: bytes, start: int, count: int, row_size: int, record: byt
     `record` is what the file says of its compression; the points begin at byte `start`.
     """
     compressor, fields = _fields(record)
-    if compressor not in (_CHUNKED, _LAYERED) or sum(size for _, size in fields) != row_size:
+    known = {_CHUNKED: _JOINT_SIZES, _LAYERED: _LAYERED_SIZES}.get(compressor, {})
+    extra = _LAYERED_EXTRA if compressor == _LAYERED else _JOINT_EXTRA
+    sound = all(kind == extra or known.get(kind) == size for kind, size in fields)
+    sound = sound and fields != [] and fields[0][0] == min(known)  # the coordinates come first
+    if not sound or sum(size for _, size in fields) != row_size:
         raise CloudFileError(
-            f"compressed by the method {compressor} in fields {fields}, "
-            f"wanted {_CHUNKED} or {_LAYERED} and rows of {row_size} bytes"
+            f"fields of (kind, bytes) {fields[:8]}, compressed by method {compressor}; "
+            f"wanted known ones that make rows of {row_size} bytes, and method 2 or 3"
         )
     (chunk_size,) = struct.unpack_from("<I", record, 12)
     table = _table_position(data, start)
@@ -78,7 +86,7 @@ def _walk_layers(
     data: bytes, position: int, end: int, chunks: int, row_size: int, fields: list[tuple[int, int]]
 ) -> int:
     """The points in all chunks; each is a point, a count, the sizes of its layers, and those."""
-    layers = sum(size if kind == _OWN_BYTES else _LAYERS.get(kind, 0) for kind, size in fields)
+    layers = sum(size if kind == _LAYERED_EXTRA else _LAYERS[kind] for kind, size in fields)
     held = 0
     for chunk in range(chunks):
         sizes_at = position + row_size + 4

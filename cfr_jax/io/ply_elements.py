@@ -53,6 +53,9 @@ def read_text(data: bytes, body: int, elements: list[Element]) -> tuple[Columns,
             continue
         rows = lines.run(taken, element.count, f"rows of element {element.name!r}")
         taken += element.count
+        if not element.counters:
+            columns[element.name] = _text_columns(rows, element)
+            continue
         values, position = rows.rows()
         ends = np.append(position[1:], len(values))
         found: dict[str, np.ndarray] = {}
@@ -74,6 +77,17 @@ def read_text(data: bytes, body: int, elements: list[Element]) -> tuple[Columns,
         _check_rows(position == ends, rows, element)
         columns[element.name] = found
     return columns, lists
+
+
+def _text_columns(rows: Lines, element: Element) -> dict[str, np.ndarray]:
+    """The properties of an element without lists."""
+    table = rows.table()
+    if len(table) and table.shape[1] != len(element.types):
+        _check_rows(np.zeros(1, bool), rows, element)
+    return {
+        label: table[:, column] if len(table) else np.empty(0)
+        for column, label in enumerate(element.types)
+    }
 
 
 def _check_rows(good: np.ndarray, rows: Lines, element: Element) -> None:

@@ -45,4 +45,4 @@ def _split(line: bytes, delimiter: str | None) -> list[bytes]:
 def save(stream: BinaryIO, cloud: PointCloud) -> None:
     """x y z and, if there are normals, nx ny nz, with the digits that float64 needs."""
     table = cloud.points if cloud.normals is None else np.hstack([cloud.points, cloud.normals])
-    np.savetxt(stream, table, fmt="%.17g")
+    np.savetxt(stream, table, fmt="%s")
