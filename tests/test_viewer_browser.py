@@ -32,7 +32,7 @@ QUIET = [
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    "--window-size=1100,760",
+    "--window-size=900,640",
 ]
 
 
@@ -335,13 +335,20 @@ def test_bigger_points_cover_more(open_page):
 
 def test_the_page_plays_once_by_itself_and_again_when_asked(open_page, chromium):
     prefer(chromium.driver, reduced_motion=False)
-    page = open_page(make_scene())
+    scene = make_scene()
+    page = open_page(make_scene(transforms=scene.transforms[[0, -1]], labels=("start", "refined")))
     try:
-        assert float(page.root("station")) < 3
-        page.wait_for_station(3.0)
-        page.click("play")
-        assert float(page.root("station")) < 3
-        page.wait_for_station(3.0)
+        page.wait_for_station(1.0)
+        seen = page.driver.execute_async_script(
+            "const [done, seen, root] = [arguments[0], [], document.documentElement];"
+            "new MutationObserver(() => {"
+            "  seen.push(Number(root.dataset.station));"
+            "  if (seen.at(-1) === 1) done(seen);"
+            "}).observe(root, {attributeFilter: ['data-station']});"
+            "document.getElementById('play').click();"
+        )
+        assert seen[0] == 0.0 and any(0 < station < 1 for station in seen)
+        assert seen == sorted(seen)
     finally:
         prefer(chromium.driver, reduced_motion=True)
 
