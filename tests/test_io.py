@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from io_samples import COUNT, normals, pcd, points, surface, write_clouds, write_las, write_meshes
 
-from cfr_jax.io import PointCloud, read, write
+from cfr_jax.io import CloudFileError, PointCloud, read, write
 
 CLOUDS = (
     "text.ply", "little.ply", "big.ply", "text.pcd", "binary.pcd", "compressed.pcd", "plain.xyz",
@@ -104,7 +104,7 @@ def test_samples_leave_a_cloud_as_it_is(clouds):
     assert len(read(clouds["little.ply"], samples=10)) == COUNT
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz", ".txt", ".npy", ".npz"])
+@pytest.mark.parametrize("suffix", [".ply", ".xyz", ".txt", ".npy", ".npz"])
 @pytest.mark.parametrize("with_normals", [False, True])
 def test_what_is_written_is_read_back(suffix, with_normals, tmp_path):
     # given coordinates that need all digits of float64, far from the origin as maps have them
@@ -123,12 +123,29 @@ def test_what_is_written_is_read_back(suffix, with_normals, tmp_path):
         assert back.normals is None
 
 
-def test_pcd_is_written_in_float32_only_where_that_is_precise_enough(tmp_path):
-    near = np.random.default_rng(0).normal(size=(40, 3))
-    for shift, kind in ((0.0, b"SIZE 4 4 4\n"), (1e6, b"SIZE 8 8 8\n")):
-        write(tmp_path / "cloud.pcd", PointCloud(near + shift))
-        assert kind in (tmp_path / "cloud.pcd").read_bytes()
-        np.testing.assert_allclose(read(tmp_path / "cloud.pcd").points, near + shift, atol=5e-7)
+def test_pcd_is_written_in_float32_unless_that_would_deform_the_cloud(tmp_path):
+    # given clouds of an extent of a few meters, nearer and farther from their origin
+    near = PointCloud(np.random.default_rng(0).normal(size=(60, 3)), normals())
+    far = PointCloud(near.points + 1e6)
+    write(tmp_path / "cloud.pcd", near)
+    before = (tmp_path / "cloud.pcd").read_bytes()
+
+    # when
+    back = read(tmp_path / "cloud.pcd")
+    with pytest.raises(CloudFileError, match=r"cloud\.pcd: PCD holds float32.* wanted \.ply"):
+        write(tmp_path / "cloud.pcd", far)
+
+    # then
+    np.testing.assert_allclose(back.points, near.points, atol=3e-7)
+    np.testing.assert_allclose(back.normals, near.normals, atol=1e-7)
+    assert b"SIZE 4 4 4 4 4 4\n" in before and (tmp_path / "cloud.pcd").read_bytes() == before
+
+
+def test_a_single_point_is_written_in_every_format(tmp_path):
+    for suffix in (".ply", ".pcd", ".xyz", ".txt", ".npy", ".npz"):
+        write(tmp_path / f"cloud{suffix}", PointCloud(np.array([[0.5, 1e6, -3.0]])))
+        back = read(tmp_path / f"cloud{suffix}")
+        np.testing.assert_array_equal(back.points, [[0.5, 1e6, -3.0]])
 
 
 def test_other_libraries_read_the_ply_that_is_written(tmp_path):

@@ -139,6 +139,29 @@ def test_headers_that_promise_more_than_the_file_holds_are_refused_at_once(tmp_p
         assert "00000" in refusal(tmp_path / name)
 
 
+@pytest.mark.parametrize("value", [1e30, np.inf, -np.inf, np.nan])
+@pytest.mark.parametrize(
+    "name", ["little.ply", "binary.pcd", "velodyne.bin", "box.stl", "format3.las"]
+)
+def test_values_that_are_no_coordinates_are_refused_in_binary_files_too(name, value, tmp_path):
+    # given a sample whose first point is at `value` along x
+    path = {**write_clouds(tmp_path), **write_meshes(tmp_path)}[name]
+    data = bytearray(path.read_bytes())
+    if name == "format3.las":
+        data[155:163] = struct.pack("<d", value)  # the offset of all points
+    else:
+        first = read(path, samples=0).points[0]
+        at = data.index(first.astype("<f4").tobytes())
+        data[at : at + 4] = struct.pack("<f", value)
+    path.write_bytes(data)
+
+    # then
+    if name == "binary.pcd" and np.isnan(value):
+        assert read(path).dropped == 1  # how PCD marks a cell without a point
+    else:
+        assert re.search("point 0 is|the offset is", refusal(path))
+
+
 def test_an_archive_that_unfolds_to_far_more_than_itself_is_refused(tmp_path):
     np.savez_compressed(tmp_path / "bomb.npz", points=np.zeros((2_000_000, 3)))
     assert "100 times the file" in refusal(tmp_path / "bomb.npz")

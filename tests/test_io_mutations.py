@@ -18,6 +18,7 @@ import time
 import warnings
 from pathlib import Path
 
+import numpy as np
 from io_samples import write_clouds, write_meshes
 
 CASES = 2000
@@ -91,7 +92,8 @@ def run_cases(cases: int, seed: int) -> dict:
             before = _reset_peak()
             start = time.perf_counter()
             try:
-                read(path)
+                cloud = read(path)
+                assert len(cloud) > 0 and np.isfinite(cloud.points).all()
             except CloudFileError as error:
                 refused += 1
                 messages.add(str(error))

@@ -28,15 +28,16 @@ class PointCloud:
     1e12, a normal without a direction.
 
     Attributes:
-        points: (n, 3) with n >= 1, in the unit and the frame they came in.
-        normals: (n, 3) of length one, or None.
+        points: (n, 3) float64, n >= 1, in the unit and the frame they came in.
+        normals: (n, 3) float64 of length one, or None.
         name: what to call the cloud in messages and pictures: for a file, its name.
         dropped: rows left out on reading because they carry no point, which organized PCD
             clouds mark by NaN.
     """
 
-    points: Float64[np.ndarray, "n 3"]
-    normals: Float64[np.ndarray, "n 3"] | None = None
+    # Plain arrays: construction takes any numbers, and answers a wrong shape itself.
+    points: np.ndarray
+    normals: np.ndarray | None = None
     name: str = "cloud"
     dropped: int = 0
 

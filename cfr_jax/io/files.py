@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 import uuid
@@ -78,26 +79,27 @@ def read(path: str | os.PathLike[str], *, samples: int | None = None, seed: int 
 def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
     """Writes points and normals; a file of that name is replaced only once all is written.
 
-    The suffix chooses: `.ply` (binary, double), `.pcd` (binary, float where that is precise
-    enough), `.xyz` and `.txt` (text), `.npy` ((n, 3) or (n, 6)), `.npz` (`points`, `normals`).
+    The suffix chooses: `.ply` (binary, double), `.pcd` (binary, float), `.xyz` and `.txt`
+    (text), `.npy` ((n, 3) or (n, 6)), `.npz` (`points`, `normals`).
 
     Raises:
-        CloudFileError: the suffix is none of these, or the folder cannot be written to.
+        CloudFileError: the suffix is none of these, the folder cannot be written to, or the
+            cloud lies so far from its origin that PCD's float32 would deform it.
     """
     path = Path(path)
+    beside = path.parent / f".{uuid.uuid4().hex}{path.suffix}"
     try:
         save = _chosen(_WRITERS, path.suffix.lower())
-    except CloudFileError as error:
-        raise CloudFileError(f"{path}: {error}") from None
-    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    try:
         with open(beside, "xb") as stream:
             save(stream, cloud)
         os.replace(beside, path)
     except OSError as error:
         raise CloudFileError(f"{path}: cannot be written: {error.strerror}") from None
+    except CloudFileError as error:
+        raise CloudFileError(f"{path}: {error}") from None
     finally:
-        beside.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # it is there only if something went wrong
+            beside.unlink()
 
 
 def _chosen(formats: dict[str, Callable], suffix: str) -> Callable:

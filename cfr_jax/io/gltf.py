@@ -23,7 +23,8 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 # A mesh may be placed many times; this bounds the rows that a small file can unfold to.
 _ALWAYS_ALLOWED_ROWS = 1 << 19
-_MOST_ROWS_PER_BYTE = 2
+_MOST_ROWS_PER_BYTE = 1
+_ROWS_PER_PRIMITIVE = 64  # what even an empty one takes, in time
 
 
 def parse_glb(data: bytes, name: str, folder: Path) -> Mesh:
@@ -82,7 +83,7 @@ class _Scene:
         for index, placement in self._placed_meshes():
             for primitive in _get(self._item("meshes", index), "primitives", list):
                 points, faces = self._primitive(primitive)
-                self.room -= len(points) + len(faces)
+                self.room -= len(points) + len(faces) + _ROWS_PER_PRIMITIVE
                 if self.room < 0:
                     raise CloudFileError("unfolds, by meshes placed again, to more than we read")
                 with np.errstate(all="ignore"):  # what is not finite is refused later on
@@ -99,7 +100,8 @@ class _Scene:
             scene = self._item("scenes", _get(self.document, "scene", int, 0))
             roots = _get(scene, "nodes", list, [])
         else:
-            below = [child for node in nodes for child in _get(node, "children", list, [])]
+            children = (c for node in nodes for c in _get(node, "children", list, []))
+            below = {child for child in children if type(child) is int}
             roots = [index for index in range(len(nodes)) if index not in below]
         placed = []
         visited: set[int] = set()

@@ -24,6 +24,8 @@ _KINDS = {
 _POINTS = ("x", "y", "z")
 _NORMALS = ("normal_x", "normal_y", "normal_z")
 _LONGEST_HEADER = 1 << 16
+# Of the cloud's extent; no scanner is as precise.
+_LARGEST_ROUNDING = 1e-5
 
 
 @dataclass(frozen=True)
@@ -190,13 +192,17 @@ def _read_compressed(data: bytes, header: _Header) -> dict[str, np.ndarray]:
 
 
 def save(stream: BinaryIO, cloud: PointCloud) -> None:
-    """Binary, of float32 where that moves no point by a millionth of the cloud's extent.
+    """Binary float32; a cloud that this would deform is refused.
 
-    PCL finds no point in double fields, so they are left to clouds far from their origin.
+    The format knows doubles too, but Open3D and PCL read them as zeros without a word.
     """
     extent = np.linalg.norm(np.ptp(cloud.points, axis=0))
-    rounding = np.abs(cloud.points).max() * np.finfo(np.float32).eps
-    kind, size = ("<f4", 4) if rounding <= 1e-6 * extent else ("<f8", 8)
+    rounding = np.abs(cloud.points).max() * np.finfo(np.float32).eps / 2
+    if rounding > _LARGEST_ROUNDING * extent > 0:
+        raise CloudFileError(
+            f"PCD holds float32, which here moves points by {rounding:.1g} in a cloud "
+            f"{extent:.3g} across; wanted .ply, .npy, .npz or .xyz, or points nearer the origin"
+        )
     fields, table = list(_POINTS), cloud.points
     if cloud.normals is not None:
         fields += _NORMALS
@@ -206,7 +212,7 @@ def save(stream: BinaryIO, cloud: PointCloud) -> None:
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
         "FIELDS " + " ".join(fields),
-        "SIZE" + f" {size}" * columns,
+        "SIZE" + " 4" * columns,
         "TYPE" + " F" * columns,
         "COUNT" + " 1" * columns,
         f"WIDTH {count}",
@@ -217,4 +223,4 @@ def save(stream: BinaryIO, cloud: PointCloud) -> None:
         "",
     ]
     stream.write("\n".join(lines).encode())
-    stream.write(table.astype(kind).tobytes())
+    stream.write(table.astype("<f4").tobytes())
