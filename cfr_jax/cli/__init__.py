@@ -1,0 +1,107 @@
+"""The command `cfr`: one file per command, each with `add_parser` and `run`.
+
+Only a command that computes imports JAX or numpy, and only once it runs: help stays instant.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from cfr_jax import __version__
+from cfr_jax.cli import convert, demo, register
+
+_COMMANDS = (register, demo, convert)
+
+_DESCRIPTION = """\
+Registers 3D point clouds: finds the rigid motion that lays one cloud on another.
+
+  cfr demo                          see it work on a pair that comes along
+  cfr register scan1.ply scan2.pcd  the motion from scan1 onto scan2, and how far to trust it
+"""
+
+_EPILOG = """\
+exit codes:
+  0    done
+  1    a fault of the program (with a traceback: please report it)
+  2    an input, an option or an output that cannot be used (at most three lines on stderr)
+  3    registered, but not to be trusted (only with --strict)
+  130  interrupted
+  141  whoever read the output has gone
+
+environment:
+  CFR_JAX_CACHE      where compiled programs are kept, so that the next call starts faster:
+                     a folder, or "off" (default: $XDG_CACHE_HOME/cfr_jax or ~/.cache/cfr_jax)
+  CFR_JAX_TRACEBACK  set it to see where an error message comes from
+"""
+
+INTERRUPTED = 130
+READER_GONE = 141
+UNUSABLE = 2
+_MOST_LINES = 3
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command; returns its exit code, as `cfr --help` lists them."""
+    try:
+        if sys.stdout is not None and hasattr(sys.stdout, "reconfigure"):
+            # A file's name may hold bytes that no encoding can print.
+            sys.stdout.reconfigure(errors="backslashreplace")
+        code = _run(argv)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        # The interpreter flushes once more on its way out; that has to succeed.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return READER_GONE
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    try:
+        args = _parser().parse_args(argv)
+    except SystemExit as stop:  # after help, or after `_Parser.error`
+        return int(stop.code or 0)
+    try:
+        return args.run(args)
+    except BrokenPipeError:
+        raise
+    except (ValueError, OSError) as error:
+        if os.environ.get("CFR_JAX_TRACEBACK"):
+            raise
+        print(_complaint(f"cfr {args.command}", str(error)), file=sys.stderr)
+        return UNUSABLE
+
+
+class _Parser(argparse.ArgumentParser):
+    """Complains in few lines: the usage of a command would bury what was wrong."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(UNUSABLE, _complaint(self.prog, message, f"try {self.prog} --help") + "\n")
+
+
+def _complaint(where: str, message: str, *hints: str) -> str:
+    lines = [f"{where}: error: {message}", *hints]
+    return "\n".join("\n".join(lines).splitlines()[:_MOST_LINES])
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="cfr",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"cfr_jax {__version__}")
+    commands = parser.add_subparsers(
+        title="commands", dest="command", metavar="COMMAND", required=True
+    )
+    for command in _COMMANDS:
+        command.add_parser(commands)
+    return parser

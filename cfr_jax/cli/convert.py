@@ -1,0 +1,62 @@
+"""`cfr convert`: the authors' PyTorch weights into ours."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from cfr_jax.cli import outputs
+
+_DESCRIPTION = """\
+Converts a checkpoint of the CFR authors' PyTorch program into weights for this one:
+
+  cfr convert authors.pth --out weights.safetensors
+  cfr register a.ply b.ply --weights weights.safetensors
+
+A .pth or .pt file is read by PyTorch (pip install "cfr_jax[torch]"), tensors only: nothing in it is
+run. A .safetensors or .npz file of the same tensors under the same names needs no PyTorch.
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Adds `cfr convert`."""
+    parser = commands.add_parser(
+        "convert",
+        help="the authors' PyTorch weights into ours",
+        description=_DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument("checkpoint", metavar="CHECKPOINT", type=Path, help="what to convert")
+    parser.add_argument(
+        "--out",
+        metavar="FILE.safetensors",
+        type=Path,
+        required=True,
+        help="where to write the weights",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Converts, and notes in the file what it was made from."""
+    outputs.check_output("--out", args.out, (".safetensors",))
+    outputs.check_apart([args.checkpoint], [args.out])
+
+    from hashlib import sha256
+
+    from cfr_jax import __version__
+    from cfr_jax.convert import convert
+    from cfr_jax.registration import iterations_of
+    from cfr_jax.weights import read_weights, save_params
+
+    params = convert(args.checkpoint)
+    notes = {
+        "converted_from": args.checkpoint.name,
+        "converted_from_sha256": sha256(args.checkpoint.read_bytes()).hexdigest(),
+        "converted_by": f"cfr_jax {__version__}",
+    }
+    save_params(args.out, params, notes)
+    print(f"wrote       {args.out}: {iterations_of(params)} iterations")
+    print(f"sha256      {read_weights(args.out).sha256}")
+    return 0

@@ -1,0 +1,49 @@
+"""Files that a command will write: known to be writable before it computes anything."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+# What `cfr_jax.io.write` can write; a test holds the two together.
+CLOUD_SUFFIXES = (".ply", ".pcd", ".xyz", ".txt", ".npy", ".npz")
+PAGE_SUFFIXES = (".html", ".htm")
+PICTURE_SUFFIXES = (".png",)
+
+
+def check_output(option: str, path: Path, suffixes: tuple[str, ...] = ()) -> None:
+    """Raises ValueError, naming the option, if `path` has none of the suffixes or its folder
+    takes no new file. Leaves no trace.
+    """
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise ValueError(f"{option}: got {path}, wanted a name that ends in {' '.join(suffixes)}")
+    if path.exists() and not path.is_file():  # a rename would replace even a device
+        kind = "a folder" if path.is_dir() else "no regular file"
+        raise ValueError(f"{option}: {path} is {kind}, wanted a file to write")
+    if not path.parent.is_dir():
+        raise ValueError(f"{option}: there is no folder {path.parent} to write {path.name} into")
+    try:
+        # Asking for permissions tells little (root, read-only mounts): try.
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        raise ValueError(
+            f"{option}: the folder {path.parent} cannot be written to: {error.strerror}"
+        ) from error
+
+
+def check_apart(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
+    """Raises ValueError if an output would replace an input or another output."""
+    taken = {os.path.realpath(path) for path in inputs}
+    for path in outputs:
+        place = os.path.realpath(path)
+        if place in taken:
+            raise ValueError(f"{path} would be written over: it is an input, or written twice")
+        taken.add(place)
+
+
+def can_draw() -> bool:
+    """Whether pictures can be written: they need matplotlib."""
+    return importlib.util.find_spec("matplotlib") is not None

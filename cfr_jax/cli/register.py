@@ -1,0 +1,211 @@
+"""`cfr register SOURCE TARGET`: the motion from one file onto another."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from cfr_jax.cli import outputs
+
+UNTRUSTED = 3
+
+_DESCRIPTION = """\
+Finds the rigid motion that lays SOURCE on TARGET, and says how far to trust it.
+
+The answer T is a 4x4 matrix in the unit and the frames of the two files: for a point x of SOURCE,
+T @ [x; 1] lies on TARGET. The clouds may be of any size, unit and offset; they should show parts
+of the same object or place, at the same scale.
+"""
+
+_EPILOG = """\
+files:
+  clouds    .ply .pcd .xyz .txt .csv .npy .npz .bin (KITTI) .las .laz (pip install "cfr_jax[io]")
+  surfaces  .off .obj .stl .glb .gltf, and .ply with faces: points are drawn from them by area
+
+what the quality means:
+  fitness         share of the source's points that lie within the inlier distance of the target
+  inlier RMSE     root mean square distance of those points, in the files' unit
+  confidence      0 to 1: how likely the answer is right
+  not determined  the shapes leave a motion open (a plane on a plane, a line, a sphere)
+  not trusted     the clouds may not overlap, or the answer is too weak to be used unchecked
+
+examples:
+  cfr register a.ply b.ply                             print the motion and its quality
+  cfr register a.ply b.ply --out a_on_b.ply            write the source, moved onto the target
+  cfr register a.pcd b.las --json - | jq .transform    use it in a script
+  cfr register a.ply b.ply --view page.html            turn the result in a browser
+  cfr register a.ply b.ply --initial previous.json     start from an earlier answer
+  cfr register a.ply b.ply --strict || echo "look at it"
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Adds `cfr register`."""
+    parser = commands.add_parser(
+        "register",
+        help="the motion that lays one point cloud on another",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument("source", metavar="SOURCE", type=Path, help="the cloud that moves")
+    parser.add_argument("target", metavar="TARGET", type=Path, help="the cloud that stays")
+
+    written = parser.add_argument_group("what to write")
+    written.add_argument(
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help=f"the moved source, all its points ({' '.join(outputs.CLOUD_SUFFIXES)})",
+    )
+    written.add_argument(
+        "--json",
+        metavar="FILE",
+        type=Path,
+        help="everything that is known, as JSON; - for standard output, then nothing else goes "
+        "there",
+    )
+    written.add_argument(
+        "--view", metavar="PAGE.html", type=Path, help="a page to look at the result from all sides"
+    )
+    written.add_argument(
+        "--png",
+        metavar="PICTURE.png",
+        type=Path,
+        help='before and after (pip install "cfr_jax[viz]")',
+    )
+
+    how = parser.add_argument_group("how to register")
+    how.add_argument(
+        "--no-refine",
+        action="store_true",
+        help="take the network's own answer, without the local refinement after it",
+    )
+    how.add_argument(
+        "--weights",
+        metavar="W",
+        help="weights of the network: a name that ships with the package, or a .safetensors file",
+    )
+    how.add_argument(
+        "--initial",
+        metavar="T",
+        type=Path,
+        help="move the source by this 4x4 matrix first: .txt with 16 numbers, .npy, or .json (a "
+        "matrix, or what --json wrote); the answer includes it",
+    )
+    how.add_argument(
+        "--max-points",
+        metavar="N",
+        type=_positive,
+        help="most points of each cloud that the network sees; more are slower (default: chosen)",
+    )
+    how.add_argument(
+        "--seed",
+        metavar="S",
+        type=_not_negative,
+        default=0,
+        help="of the random choice of points (default: 0); the same seed gives the same answer",
+    )
+    how.add_argument(
+        "--strict",
+        action="store_true",
+        help=f"exit with {UNTRUSTED} if the answer is not to be trusted; files are written anyway",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Reads, registers, writes; whatever can be refused is refused before JAX is imported."""
+    to_stdout = args.json == Path("-")
+    _check_outputs(args, to_stdout)
+
+    from cfr_jax import io
+    from cfr_jax.cli.transforms import read_transform
+
+    initial = None if args.initial is None else read_transform(args.initial)
+    source, target = io.read(args.source, seed=args.seed), io.read(args.target, seed=args.seed)
+
+    from cfr_jax.cli import report
+    from cfr_jax.cli.cache import keep_compiled_programs
+
+    keep_compiled_programs()
+    result = report.register(
+        source,
+        target,
+        weights=args.weights,
+        refine=not args.no_refine,
+        initial=initial,
+        max_points=args.max_points,
+        seed=args.seed,
+    )
+    if args.out is not None:
+        io.write(args.out, result.moved_source())
+    if args.json is not None:
+        document = report.as_document(result, str(args.source), str(args.target))
+        _write_json(None if to_stdout else args.json, document)
+    if args.view is not None or args.png is not None:
+        _write_pictures(args, report.as_scene(result))
+
+    for warning in result.alignment.warnings if to_stdout else ():
+        print(f"cfr register: warning: {warning}", file=sys.stderr)
+    if not to_stdout:
+        print(report.as_text(result))
+        for path in filter(None, (args.out, args.json, args.view, args.png)):
+            print(f"wrote       {path}")
+    return UNTRUSTED if args.strict and not result.alignment.trusted else 0
+
+
+def _check_outputs(args: argparse.Namespace, to_stdout: bool) -> None:
+    wanted = {
+        "--out": (args.out, outputs.CLOUD_SUFFIXES),
+        "--json": (None if to_stdout else args.json, ()),
+        "--view": (args.view, outputs.PAGE_SUFFIXES),
+        "--png": (args.png, outputs.PICTURE_SUFFIXES),
+    }
+    given = {option: (path, ends) for option, (path, ends) in wanted.items() if path is not None}
+    for option, (path, suffixes) in given.items():
+        outputs.check_output(option, path, suffixes)
+    inputs = [path for path in (args.source, args.target, args.initial) if path is not None]
+    outputs.check_apart(inputs, [path for path, _ in given.values()])
+    if args.png is not None and not outputs.can_draw():
+        raise ValueError('--png: pictures need matplotlib: pip install "cfr_jax[viz]"')
+
+
+def _write_json(path: Path | None, document: dict) -> None:
+    from cfr_jax.viewer.atomic import write_atomically
+
+    text = json.dumps(document, indent=2, allow_nan=False) + "\n"
+    if path is None:
+        sys.stdout.write(text)
+    else:
+        write_atomically(path, text.encode())
+
+
+def _write_pictures(args: argparse.Namespace, scene) -> None:
+    from cfr_jax import viewer
+
+    if args.view is not None:
+        viewer.write_page(args.view, scene)
+    if args.png is not None:
+        viewer.write_picture(args.png, scene)
+
+
+def _positive(text: str) -> int:
+    return _integer(text, 1)
+
+
+def _not_negative(text: str) -> int:
+    return _integer(text, 0)
+
+
+def _integer(text: str, least: int) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = least - 1
+    if value < least:
+        raise argparse.ArgumentTypeError(f"got {text!r}, wanted an integer of at least {least}")
+    return value

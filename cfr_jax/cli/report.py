@@ -1,0 +1,162 @@
+"""A registration with what it came from, and its three forms: text, JSON document, scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from cfr_jax import __version__
+from cfr_jax.align import Alignment, align
+from cfr_jax.io import PointCloud
+from cfr_jax.viewer import Scene
+from cfr_jax.weights import DEFAULT, Weights, read_weights
+
+FORMAT = "cfr_jax/register/1"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What went in and what came out."""
+
+    source: PointCloud
+    target: PointCloud
+    initial: Float64[np.ndarray, "4 4"] | None
+    seed: int
+    weights: Weights
+    alignment: Alignment
+
+    def moved_source(self) -> PointCloud:
+        """The whole source, laid on the target."""
+        rotation, translation = self.alignment.transform[:3, :3], self.alignment.transform[:3, 3]
+        normals = None if self.source.normals is None else self.source.normals @ rotation.T
+        return PointCloud(self.source.points @ rotation.T + translation, normals, self.source.name)
+
+
+def register(
+    source: PointCloud,
+    target: PointCloud,
+    *,
+    weights: str | None = None,
+    refine: bool = True,
+    initial: Float64[np.ndarray, "4 4"] | None = None,
+    max_points: int | None = None,
+    seed: int = 0,
+) -> Result:
+    """`align` with weights by name or path; raises ValueError as `align` and `read_weights` do."""
+    chosen = read_weights(DEFAULT if weights is None else weights)
+    alignment = align(
+        source,
+        target,
+        params=chosen.params,
+        refine=refine,
+        initial=initial,
+        max_points=max_points,
+        seed=seed,
+    )
+    return Result(source, target, initial, seed, chosen, alignment)
+
+
+def as_document(result: Result, source_path: str, target_path: str) -> dict[str, Any]:
+    """Everything that is known, as `register.schema.json` describes it."""
+    found = result.alignment
+    return {
+        "format": FORMAT,
+        "version": __version__,
+        "source": _cloud(result.source, source_path, len(found.source_rows)),
+        "target": _cloud(result.target, target_path, len(found.target_rows)),
+        "transform": found.transform.tolist(),
+        "transforms": found.transforms.tolist(),
+        "initial": None if result.initial is None else result.initial.tolist(),
+        "refined": bool(found.refined),
+        "trusted": bool(found.trusted),
+        "determined": bool(found.determined),
+        "confidence": _number(found.confidence),
+        "fitness": _number(found.fitness),
+        "inlier_rmse": _number(found.inlier_rmse),
+        "inlier_distance": _number(found.inlier_distance),
+        "warnings": list(found.warnings),
+        "neighbors": int(found.neighbors),
+        "seed": result.seed,
+        "weights": {"name": result.weights.name, "sha256": result.weights.sha256},
+        "seconds": {name: float(value) for name, value in found.seconds.items()},
+    }
+
+
+def as_text(result: Result) -> str:
+    """The transform and its quality, for people."""
+    found = result.alignment
+    rotation, translation = found.transform[:3, :3], found.transform[:3, 3]
+    angle = math.degrees(Rotation.from_matrix(rotation).magnitude())
+    verdict = "trusted" if found.trusted else "not trusted"
+    if not found.determined:
+        verdict += ", not determined"
+    lines = [
+        f"source      {result.source.name}: {_counts(result.source, len(found.source_rows))}",
+        f"target      {result.target.name}: {_counts(result.target, len(found.target_rows))}",
+        "transform   source onto target, T @ [x; 1]:",
+        *("    " + _row(row) for row in found.transform),
+        f"motion      {angle:.3f}° about one axis, translation {np.linalg.norm(translation):.6g}",
+        *(f"{name:<11} {text}" for name, text in quality(found).items()),
+        f"verdict     {verdict}",
+        *(f"warning     {text}" for text in found.warnings),
+        "time        {run:.3f} s, and {compile:.1f} s to compile".format(**found.seconds),
+    ]
+    return "\n".join(lines)
+
+
+def quality(found: Alignment) -> dict[str, str]:
+    """The figures a reader judges by, written out."""
+    return {
+        "confidence": f"{found.confidence:.2f}",
+        "fitness": f"{found.fitness:.3f} of the source within {found.inlier_distance:.4g}",
+        "inlier RMSE": f"{found.inlier_rmse:.4g}",
+        "refined": "yes" if found.refined else "no",
+    }
+
+
+def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
+    """The way from the start to the answer, with `facts` before the figures of quality."""
+    found = result.alignment
+    start = np.eye(4) if result.initial is None else result.initial
+    stations = [start, *found.transforms]
+    labels = ["start", *(f"iteration {i}" for i in range(1, len(found.transforms) + 1))]
+    if found.refined:
+        stations.append(found.transform)
+        labels.append("refined")
+    weights = np.full(len(result.source), np.nan)  # NaN: a point the network did not see
+    weights[found.source_rows] = found.weights
+    return Scene(
+        source=result.source.points,
+        target=result.target.points,
+        transforms=np.stack(stations),
+        labels=labels,
+        weights=weights,
+        facts={**(facts or {}), **quality(found)},
+        source_name=result.source.name,
+        target_name=result.target.name,
+        warnings=found.warnings,
+    )
+
+
+def _cloud(cloud: PointCloud, path: str, used: int) -> dict[str, Any]:
+    return {"name": cloud.name, "path": path, "points": len(cloud), "used": used}
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN: a measure over no points at all is null."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _counts(cloud: PointCloud, used: int) -> str:
+    return f"{len(cloud):,} points, {used:,} used"
+
+
+def _row(row: Float64[np.ndarray, " 4"]) -> str:
+    # Twelve digits: a millimeter at map coordinates, and more than a rotation needs.
+    return " ".join(f"{value:17.12g}" for value in row)
