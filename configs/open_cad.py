@@ -17,7 +17,7 @@ def get_config() -> ConfigDict:
     # weights depend neither on the points nor on the neighbors (docs/training.md).
     config.phases = (
         {"steps": 3000, "points": 256, "neighbors": 24, "batch": 8},
-        {"steps": 7500, "points": 717, "neighbors": 32, "batch": 8},
+        {"steps": 5000, "points": 717, "neighbors": 32, "batch": 8},
     )
 
     config.sampling = ConfigDict()
@@ -26,7 +26,7 @@ def get_config() -> ConfigDict:
     config.sampling.translation = 0.5
     config.sampling.any_orientation = 0.3  # of the shapes; the rest stand upright, as CAD models do
     config.sampling.scale = (0.8, 1.2)
-    config.sampling.estimated_normals = 0.25
+    config.sampling.estimated_normals = 0.4
 
     config.train = ConfigDict()
     config.train.peak_rate = 1e-3
