@@ -50,32 +50,44 @@ def main(argv: Sequence[str] | None = None) -> int:
         if sys.stdout is not None and hasattr(sys.stdout, "reconfigure"):
             # A file's name may hold bytes that no encoding can print.
             sys.stdout.reconfigure(errors="backslashreplace")
-        code = _run(argv)
-        if sys.stdout is not None:
-            sys.stdout.flush()
-        return code
+        return _run(argv)
     except BrokenPipeError:
-        # The interpreter flushes once more on its way out; that has to succeed.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return READER_GONE
     except KeyboardInterrupt:
         return INTERRUPTED
 
 
 def _run(argv: Sequence[str] | None) -> int:
+    where = "cfr"
     try:
-        args = _parser().parse_args(argv)
-    except SystemExit as stop:  # after help, or after `_Parser.error`
-        return int(stop.code or 0)
-    try:
-        return args.run(args)
+        try:
+            args = _parser().parse_args(argv)
+            where = f"cfr {args.command}"
+            code = args.run(args)
+        except SystemExit as stop:  # after help, or after `_Parser.error`
+            code = int(stop.code or 0)
+        if sys.stdout is not None:
+            sys.stdout.flush()  # while a full disk can still be told
+        return code
     except BrokenPipeError:
         raise
     except (ValueError, OSError) as error:
         if os.environ.get("CFR_JAX_TRACEBACK"):
             raise
-        print(_complaint(f"cfr {args.command}", str(error)), file=sys.stderr)
+        _drop_output()
+        print(_complaint(where, str(error)), file=sys.stderr)
         return UNUSABLE
+
+
+def _drop_output() -> None:
+    """What is still buffered for a standard output that takes no more, goes nowhere: the
+    interpreter flushes once again on its way out, and would complain."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Parser(argparse.ArgumentParser):

@@ -27,9 +27,10 @@ files:
 what the quality means:
   fitness         share of the source's points that lie within the inlier distance of the target
   inlier RMSE     root mean square distance of those points, in the files' unit
-  confidence      0 to 1: how likely the answer is right
+  confidence      probability, 0 to 1, that the motion is right to 5 degrees and a tenth of the
+                  clouds' radius
   not determined  the shapes leave a motion open (a plane on a plane, a line, a sphere)
-  not trusted     the clouds may not overlap, or the answer is too weak to be used unchecked
+  not trusted     not determined, or more likely wrong than right: do not use it unchecked
 
 examples:
   cfr register a.ply b.ply                             print the motion and its quality

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -73,18 +72,18 @@ def as_document(result: Result, source_path: str, target_path: str) -> dict[str,
         "transform": found.transform.tolist(),
         "transforms": found.transforms.tolist(),
         "initial": None if result.initial is None else result.initial.tolist(),
-        "refined": bool(found.refined),
-        "trusted": bool(found.trusted),
-        "determined": bool(found.determined),
-        "confidence": _number(found.confidence),
-        "fitness": _number(found.fitness),
-        "inlier_rmse": _number(found.inlier_rmse),
-        "inlier_distance": _number(found.inlier_distance),
+        "refined": found.refined,
+        "trusted": found.trusted,
+        "determined": found.determined,
+        "confidence": found.confidence,
+        "fitness": found.fitness,
+        "inlier_rmse": found.inlier_rmse,
+        "inlier_distance": found.inlier_distance,
         "warnings": list(found.warnings),
-        "neighbors": int(found.neighbors),
+        "neighbors": found.neighbors,
         "seed": result.seed,
         "weights": {"name": result.weights.name, "sha256": result.weights.sha256},
-        "seconds": {name: float(value) for name, value in found.seconds.items()},
+        "seconds": found.seconds,
     }
 
 
@@ -92,7 +91,7 @@ def as_text(result: Result) -> str:
     """The transform and its quality, for people."""
     found = result.alignment
     rotation, translation = found.transform[:3, :3], found.transform[:3, 3]
-    angle = math.degrees(Rotation.from_matrix(rotation).magnitude())
+    angle = np.degrees(Rotation.from_matrix(rotation).magnitude())
     verdict = "trusted" if found.trusted else "not trusted"
     if not found.determined:
         verdict += ", not determined"
@@ -146,11 +145,6 @@ def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
 
 def _cloud(cloud: PointCloud, path: str, used: int) -> dict[str, Any]:
     return {"name": cloud.name, "path": path, "points": len(cloud), "used": used}
-
-
-def _number(value: float) -> float | None:
-    """JSON has no NaN: a measure over no points at all is null."""
-    return float(value) if math.isfinite(value) else None
 
 
 def _counts(cloud: PointCloud, used: int) -> str:

@@ -1,0 +1,61 @@
+"""`cfr convert`: a checkpoint in, weights out, and where they came from."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+from oracle.authors import random_state_dict
+
+from cfr_jax.cli import main
+from cfr_jax.convert import from_state_dict
+from cfr_jax.weights import read_weights
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    path = tmp_path / "authors.npz"
+    np.savez(path, **random_state_dict(0))
+    return path
+
+
+def test_converted_weights_can_be_loaded_and_say_what_they_were_made_from(
+    checkpoint, tmp_path, capsys
+):
+    # when
+    code = main(["convert", str(checkpoint), "--out", str(tmp_path / "ours.safetensors")])
+
+    # then
+    weights = read_weights(tmp_path / "ours.safetensors")
+    wanted = from_state_dict(random_state_dict(0))
+    assert code == 0 and weights.sha256 in capsys.readouterr().out
+    np.testing.assert_array_equal(weights.params["cascade"]["kernel"], wanted["cascade"]["kernel"])
+    assert weights.notes["converted_from"] == "authors.npz"
+    digest = hashlib.sha256(checkpoint.read_bytes()).hexdigest()
+    assert weights.notes["converted_from_sha256"] == digest
+
+
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [
+        ("missing.pth", "ours.safetensors"),
+        ("authors.npz", "ours.npz"),
+        ("authors.npz", "nowhere/ours.safetensors"),
+        ("damaged.npz", "ours.safetensors"),
+    ],
+)
+def test_what_cannot_be_converted_is_told_and_nothing_is_written(
+    source, target, checkpoint, tmp_path, monkeypatch, capsys
+):
+    # given
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "damaged.npz").write_bytes(checkpoint.read_bytes()[:1000])
+
+    # when
+    code = main(["convert", source, "--out", target])
+
+    # then
+    err = capsys.readouterr().err
+    assert code == 2 and err.startswith("cfr convert: error: ") and err.count("\n") <= 3
+    assert not (tmp_path / target).exists()
