@@ -79,9 +79,7 @@ class Cascade(nn.Module):
     ) -> Float[Array, "n d"]:
         """Layer `i` (from 0) alone; unit rows."""
         moved = features + points @ self.position[i]
-        hidden = nn.relu(
-            group_norm(moved, self.scale[i], self.shift[i], groups=GROUPS, mask=mask)
-        )
+        hidden = nn.relu(group_norm(moved, self.scale[i], self.shift[i], groups=GROUPS, mask=mask))
         return unit_rows(hidden @ self.kernel[i] + self.bias[i])
 
     def at_rest(
@@ -111,13 +109,16 @@ class AnnealingNet(nn.Module):
         source_mask: Bool[Array, " n"] | None = None,
         target_mask: Bool[Array, " m"] | None = None,
     ) -> Annealing:
-        flagged = [jnp.pad(source, ((0, 0), (0, 1))), jnp.pad(target, ((0, 0), (0, 1)), constant_values=1)]
+        flagged = [
+            jnp.pad(source, ((0, 0), (0, 1))),
+            jnp.pad(target, ((0, 0), (0, 1)), constant_values=1),
+        ]
         x = jnp.concatenate(flagged)
         mask = _join_masks(source, target, source_mask, target_mask)
         for i, (width, groups) in enumerate(((64, 8), (64, 8), (64, 8), (128, 8), (1024, 16))):
             x = self._layer(f"point_{i}", x, width, groups, mask)
         # after the ReLU nothing is below zero, so zeros never win where there is a valid point
-        x = jnp.max(x if mask is None else x * mask[:, None], axis=0, keepdims=True)
+        x = jnp.max(x if mask is None else jnp.where(mask[:, None], x, 0), axis=0, keepdims=True)
         for i, width in enumerate((512, 256)):
             x = self._layer(f"pair_{i}", x, width, 16, None)
         x = nn.softplus(nn.Dense(2 * self.iterations, kernel_init=_kernel_init, name="out")(x)[0])
@@ -163,7 +164,7 @@ def group_norm(
     if mask is None:
         where, count = None, n
     else:
-        where, count = mask[:, None, None], jnp.maximum(jnp.sum(mask), 1)
+        where, count = mask[:, None, None], jnp.maximum(jnp.sum(mask, dtype=x.dtype), 1)
     count = count * (channels // groups)
     mean = jnp.sum(grouped, axis=(0, 2), keepdims=True, where=where) / count
     centered = grouped - mean

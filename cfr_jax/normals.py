@@ -43,7 +43,8 @@ def estimate_normals(
     if mask is None:
         centroid = jnp.mean(points, axis=0)
     else:
-        centroid = jnp.sum(jnp.where(mask[:, None], points, 0), axis=0) / jnp.maximum(mask.sum(), 1)
+        count = jnp.maximum(jnp.sum(mask, dtype=points.dtype), 1)
+        centroid = jnp.sum(jnp.where(mask[:, None], points, 0), axis=0) / count
     outward = jnp.sum(normals * (points - centroid), axis=1, keepdims=True) >= 0
     normals = jnp.where(outward, normals, -normals)
     return normals if mask is None else jnp.where(mask[:, None], normals, 0)

@@ -81,6 +81,7 @@ class Registration:
         return self.transforms[-1]
 
 
+@functools.partial(jax.jit, static_argnames=("settings",))
 def prepare(
     points: Float[Array, "n c"],
     *,
@@ -93,19 +94,19 @@ def prepare(
     Missing normals are estimated (`normals.estimate_normals`); missing neighbors are searched on the
     device. Fewer than K + 1 points have fewer neighbors each. Raises ValueError on wrong shapes.
     """
-    if points.ndim != 2 or points.shape[1] not in (3, 6):
-        raise ValueError(
-            f"points: got shape {points.shape}, wanted (n, 3) points or (n, 6) points and normals"
-        )
-    if points.shape[0] < 3:
-        raise ValueError(f"points: got {points.shape[0]} points, wanted at least 3")
+    _check_points("points", points)
+    n = points.shape[0]
+    if mask is not None and mask.shape != (n,):
+        raise ValueError(f"mask: got shape {mask.shape}, wanted ({n},) as there are {n} points")
+    if neighbors is not None and (neighbors.ndim != 2 or neighbors.shape[0] != n):
+        raise ValueError(f"neighbors: got shape {neighbors.shape}, wanted ({n}, k)")
     points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
     normals = points[:, 3:] if points.shape[1] == 6 else None
     points = points[:, :3]
     if mask is not None:
         points = jnp.where(mask[:, None], points, 0)
     if neighbors is None:
-        k = min(settings.neighbors, points.shape[0] - 1)
+        k = min(settings.neighbors, n - 1)
         neighbors = knn.nearest(lax.stop_gradient(points), k, radius=settings.radius, mask=mask)
     if normals is None:
         normals = estimate_normals(points, neighbors, mask)
@@ -114,11 +115,12 @@ def prepare(
     return Cloud(points, normals, neighbors, mask)
 
 
+@functools.partial(jax.jit, static_argnames=("settings",))
 def encode(
     params: dict, target: Float[Array, "m c"] | Cloud, *, settings: Settings = Settings()
 ) -> Encoded:
     """The features of a reference in every iteration; hand it to `register` as the target."""
-    cloud = target if isinstance(target, Cloud) else prepare(target, settings=settings)
+    cloud = _prepared("target", target, settings)
     network = bind(params)
     features = network.cascade.at_rest(
         _heavy_features(network, cloud, settings), cloud.points, cloud.mask
@@ -147,7 +149,7 @@ def register(
     iterations = iterations_of(params) if iterations is None else iterations
     if iterations < 1:
         raise ValueError(f"iterations: got {iterations}, wanted at least 1")
-    source = source if isinstance(source, Cloud) else prepare(source, settings=settings)
+    source = _prepared("source", source, settings)
     if not isinstance(target, Encoded):
         target = encode(params, target, settings=settings)
     steps = list(iterate(params, source, target, iterations, settings))
@@ -219,6 +221,22 @@ def iterations_of(params: dict) -> int:
 def bind(params: dict) -> CFR:
     """The network with its parameters inside."""
     return CFR(iterations_of(params)).bind({"params": params})
+
+
+def _prepared(name, cloud, settings):
+    if isinstance(cloud, Cloud):
+        return cloud
+    _check_points(name, cloud)
+    return prepare(cloud, settings=settings)
+
+
+def _check_points(name, points):
+    if points.ndim != 2 or points.shape[1] not in (3, 6):
+        raise ValueError(
+            f"{name}: got shape {points.shape}, wanted (n, 3) points or (n, 6) points and normals"
+        )
+    if points.shape[0] < 3:
+        raise ValueError(f"{name}: got {points.shape[0]} points, wanted at least 3")
 
 
 def _heavy_features(network, cloud, settings):

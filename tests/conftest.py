@@ -5,13 +5,15 @@ Imported before any test module, so that the checks are in place before `cfr_jax
 
 import hashlib
 import os
+import typing
 from pathlib import Path
 
 import jax
+import jaxtyping
 import pytest
-from jaxtyping import install_import_hook
+from oracle import authors
 
-install_import_hook("cfr_jax", "beartype.beartype")
+jaxtyping.install_import_hook("cfr_jax", "beartype.beartype")
 
 
 def pytest_configure(config):
@@ -21,6 +23,21 @@ def pytest_configure(config):
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_compilation_cache_dir", str(_cache_folder()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+
+def pytest_sessionstart():
+    # The fields of a result state the shapes of one pair. Coming out of vmap or a scan it is made
+    # anew, with one more axis in front or with placeholders, and that is no mistake.
+    from cfr_jax import losses, registration, training
+
+    for kind in (
+        registration.Cloud,
+        registration.Encoded,
+        registration.Registration,
+        losses.PairLoss,
+        training.TrainState,
+    ):
+        typing.no_type_check(kind.__init__)
 
 
 def _cache_folder() -> Path:
@@ -40,3 +57,23 @@ def x64():
     """Float64 inside the test."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Lets the test see what the library itself says of wrong arguments."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture(scope="session")
+def state_dict():
+    """Random weights as the authors' program would store them."""
+    return authors.random_state_dict(0)
+
+
+@pytest.fixture(scope="session")
+def params(state_dict):
+    """The same weights as ours."""
+    from cfr_jax.convert import from_state_dict
+
+    return from_state_dict(state_dict)
