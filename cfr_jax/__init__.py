@@ -13,8 +13,8 @@ import importlib
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Alignment": "align",
-    "align": "align",
+    "Alignment": "alignment",
+    "align": "alignment",
     "Cloud": "registration",
     "Encoded": "registration",
     "Registration": "registration",
@@ -35,7 +35,6 @@ def __getattr__(name: str):
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    # importing the module `align` binds the package's attribute of that name to the module
     globals()[name] = value
     return value
 

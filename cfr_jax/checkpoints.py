@@ -13,7 +13,7 @@ from cfr_jax.training import TrainState
 
 @dataclasses.dataclass
 class Checkpoints:
-    """The checkpoints in a folder; use as a context, so that the last one is finished on leaving."""
+    """The checkpoints in a folder; leaving the context waits for the last one."""
 
     folder: Path
     keep: int

@@ -1,17 +1,20 @@
 """The heavy part: a shared MLP on every neighbor of every point, pooled by maximum.
 
-Three layers of Linear, GroupNorm and ReLU see n k rows per cloud, and the norm's statistics run over
-all of them, so the plain form writes and reads n k 96 floats eight times, and four times that for its
-gradient. Here no activation of that size is ever stored: tiles of points stay in a core's cache.
+Three layers of Linear, GroupNorm and ReLU see n k rows per cloud, and the norm's statistics run
+over all of them, so the plain form writes and reads n k 96 floats eight times, and four times that
+for its gradient. Here no activation of that size is ever stored: tiles of points stay in a core's
+cache.
 
-- The first layer's statistics follow exactly from the mean and covariance of the seven raw channels.
+- The first layer's statistics follow exactly from the mean and covariance of the seven raw
+  channels.
 - One pass over the tiles sums the second layer's output for its statistics.
-- A second pass, the first two norms folded into their weights, sums the third layer's output and keeps
+- A second pass, the first two norms folded into their weights, sums the third layer's output and
+  keeps
   its largest and smallest value over the neighbors. The norm and the ReLU are monotonic per channel,
   so the pooled feature is one of these two, normalized.
 
-The gradient is written out for the same reason. Through a norm it is the incoming gradient minus its
-projections on 1 and on the normalized values, and both projections are sums over rows: the last
+The gradient is written out for the same reason. Through a norm it is the incoming gradient minus
+its projections on 1 and on the normalized values, and both projections are sums over rows: the last
 layer's follow from the pooled values alone, the first layer's from sums of seven channels.
 """
 
@@ -109,9 +112,10 @@ def _backward(groups, residuals, gradient):
     width = three.bias.size
     tiles, weights = _tiles(raw, valid)
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
-    folded_one, folded_two = _fold(one, norm_one), _fold(two, norm_two)
+    kernel_first, bias_first = _fold(one, norm_one)
 
-    # Third norm: only the extreme of each point receives gradient, so its projections are sums over n.
+    # Third norm: only the extreme of each point receives gradient, so its projections are sums over
+    # n.
     alive = normal * three.scale + three.shift > 0
     gradient = jnp.where(alive, gradient, 0) * valid[:, None]
     shift_three, scale_three = gradient.sum(0), (gradient * normal).sum(0)
@@ -121,7 +125,7 @@ def _backward(groups, residuals, gradient):
 
     def through_three(sums, tile):
         raw, weight, incoming = tile
-        y_one = jax.nn.relu(raw @ folded_one[0] + folded_one[1])
+        y_one = jax.nn.relu(raw @ kernel_first + bias_first)
         z_two = y_one @ two.kernel + two.bias
         n_two = (z_two - norm_two.mean) * norm_two.rate
         y_two = jax.nn.relu(n_two * two.scale + two.shift)
@@ -152,7 +156,7 @@ def _backward(groups, residuals, gradient):
 
     def through_two(sums, tile):
         raw, weight, d_n = tile
-        y_one = jax.nn.relu(raw @ folded_one[0] + folded_one[1])
+        y_one = jax.nn.relu(raw @ kernel_first + bias_first)
         n_two = (y_one @ two.kernel + (two.bias - norm_two.mean)) * norm_two.rate
         dense = (flat_two + tilt_two * n_two) * weight[:, None]
         d_z = (d_n * two.scale - dense) * norm_two.rate
@@ -229,7 +233,9 @@ def _moments_of_first(layer, raw, valid, rows):
 def _norm(mean, variance, groups):
     """Channel moments joined into group statistics, spread over the channels again."""
     joined = mean.reshape(groups, -1).mean(1, keepdims=True)
-    spread = ((mean.reshape(groups, -1) - joined) ** 2).mean(1) + variance.reshape(groups, -1).mean(1)
+    spread = ((mean.reshape(groups, -1) - joined) ** 2).mean(1) + variance.reshape(groups, -1).mean(
+        1
+    )
     size = mean.size // groups
     rate = lax.rsqrt(jnp.maximum(spread, 0) + EPSILON)
     return _Norm(jnp.repeat(joined[:, 0], size), jnp.repeat(rate, size))

@@ -1,9 +1,9 @@
 """Raw channels of a point and its neighbors, before anything is learned.
 
-The point-pair feature (Drost et al., 2010) of a point p with normal n and a neighbor q with normal m,
-d = q - p: how d lies to both normals, how the normals lie to each other, and |d|. It does not change
-under rigid motions. Two forms: "dot" (CFR) takes inner products of unit vectors, "angle" (RPM-Net)
-their angles.
+The point-pair feature (Drost et al., 2010) of a point p with normal n and a neighbor q with normal
+m, d = q - p: how d lies to both normals, how the normals lie to each other, and |d|. It does not
+change under rigid motions. Two forms: "dot" (CFR) takes inner products of unit vectors, "angle"
+(RPM-Net) their angles.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ from cfr_jax.registration import Cloud, Settings, Step, encode, iterate, iterati
 
 _DISCOUNT = 0.5  # the last iteration counts fully, each one before it half of the next
 _INLIER_WEIGHT = 0.01
-# Soft targets of the correspondence term, in the unit sphere: measured to learn faster than the pose
-# alone (docs/training.md).
+# Soft targets of the correspondence term, in the unit sphere: measured to learn faster than the
+# pose alone (docs/training.md).
 _SPREAD = 0.035
 _REACH = 0.1
 
@@ -82,7 +82,8 @@ def correspondence_loss(
     """Cross-entropy of each row's and each column's affinities, slack included, to soft targets.
 
     `squared_distance` is taken under the true motion. A point's partners share, by
-    exp(-d^2 / 2 sigma^2) up to 0.1, as much as the nearest of them is close; the slack has the rest.
+    exp(-d^2 / 2 sigma^2) up to 0.1, as much as the nearest of them is close; the slack has the
+    rest.
     """
     close = jnp.exp(squared_distance / (-2 * _SPREAD**2))
     close = jnp.where(squared_distance < _REACH**2, close, 0)

@@ -2,8 +2,8 @@
 
 Two ways to the same sets. `nearest` is pure JAX for any device; `nearest_on_host` is a KD-tree for
 clouds that are still in host memory. Only the *set* of a point's neighbors matters to the network,
-so neither sorts; both break ties by the lower index. (Distances that agree to the last bit or two of
-float32 may fall on either side of the K-th place.) Everything downstream takes indices.
+so neither sorts; both break ties by the lower index. (Distances that agree to the last bit or two
+of float32 may fall on either side of the K-th place.) Everything downstream takes indices.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ def nearest(
     """
     n = points.shape[0]
     if not 1 <= k <= n - 1:
-        raise ValueError(f"k: got {k} neighbors for a cloud of {n} points, wanted 1 <= k <= {n - 1}")
+        raise ValueError(
+            f"k: got {k} neighbors for a cloud of {n} points, wanted 1 <= k <= {n - 1}"
+        )
     points = points.astype(jnp.float32)  # as the host measures; the search works on its bits
     rows = max(1, min(n, _BLOCK // n))
     blocks = -(-n // rows)
@@ -46,7 +48,8 @@ def nearest(
     def block(start):
         row = start + jnp.arange(rows)
         here = lax.dynamic_slice_in_dim(queries, start, rows)
-        # by differences: |a|^2 - 2ab + |b|^2 cancels to nothing for close points far from the origin
+        # by differences: |a|^2 - 2ab + |b|^2 cancels to nothing for close points far from the
+        # origin
         square = sum((here[:, axis, None] - points[None, :, axis]) ** 2 for axis in range(3))
         if mask is not None:
             square = jnp.where(mask, square, jnp.inf)
@@ -163,7 +166,9 @@ def nearest_on_host(
     points = np.asarray(points, np.float32)
     n = len(points)
     if not 1 <= k <= n - 1:
-        raise ValueError(f"k: got {k} neighbors for a cloud of {n} points, wanted 1 <= k <= {n - 1}")
+        raise ValueError(
+            f"k: got {k} neighbors for a cloud of {n} points, wanted 1 <= k <= {n - 1}"
+        )
     wide = min(n, k + 8)
     _, found = cKDTree(points).query(points, wide, workers=workers)
     offset = points[found] - points[:, None]

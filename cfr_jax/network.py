@@ -155,7 +155,8 @@ def group_norm(
     groups: int,
     mask: Bool[Array, " n"] | None = None,
 ) -> Float[Array, "n c"]:
-    """GroupNorm of one cloud (Wu & He, 2018): statistics over all valid rows and a group's channels.
+    """GroupNorm of one cloud (Wu & He, 2018): statistics over all valid rows and a group's
+    channels.
 
     Flax's own takes the first axis for a batch and knows no mask.
     """

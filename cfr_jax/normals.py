@@ -1,8 +1,8 @@
 """Normals by principal components of each point's neighborhood, with a consistent sign.
 
 The direction of least spread of the neighbors is the normal of a surface (Hoppe et al., 1992). Its
-sign is arbitrary, and the network's features feel it: each normal is turned away from the centroid of
-the cloud, which two partial views of one object share roughly, and which moves with the cloud.
+sign is arbitrary, and the network's features feel it: each normal is turned away from the centroid
+of the cloud, which two partial views of one object share roughly, and which moves with the cloud.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int32
 from cfr_jax.eigen import least_direction
 
 # Neighbors count by exp(-d^2 / 2 s^2), s this share of their root mean square distance. On noisy
-# partial clouds of 717 points 64 neighbors weighted so give a median error of 18 degrees, against 21
-# unweighted and 20 with the 16 nearest alone.
+# partial clouds of 717 points 64 neighbors weighted so give a median error of 18 degrees, against
+# 21 unweighted and 20 with the 16 nearest alone.
 _REACH = 0.45
 
 

@@ -1,8 +1,9 @@
 """Local refinement of a registration: generalized ICP with a shrinking, robust cut.
 
 The network brings a cloud to within a few degrees; what is left is a smooth least-squares problem.
-Generalized ICP (Segal, Haehnel & Thrun, 2009) models each point as a small plane: it forgives a wide
-cut better than point-to-plane distances do, and needs only the direction of normals, not their sign.
+Generalized ICP (Segal, Haehnel & Thrun, 2009) models each point as a small plane: it forgives a
+wide cut better than point-to-plane distances do, and needs only the direction of normals, not their
+sign.
 """
 
 from __future__ import annotations
@@ -54,17 +55,22 @@ def refine(
 ) -> Refinement:
     """Refines `initial`, which maps source onto target, within the unit sphere.
 
-    For each cut in turn: pair every source point with its closest target point, weigh the pairs down
-    to zero at the cut (Tukey's biweight), take a Gauss-Newton step on SE(3), until nothing moves. The
-    result is kept only if it scores no worse than `initial` (`score` at the last cut).
+    For each cut in turn: pair every source point with its closest target point, weigh the pairs
+    down to zero at the cut (Tukey's biweight), take a Gauss-Newton step on SE(3), until nothing
+    moves. The result is kept only if it scores no worse than `initial` (`score` at the last cut).
     """
-    transform, steps, converged = initial, jnp.zeros((), jnp.int32), jnp.array(True)
-    for cut in cuts:
-        transform, taken, converged = _descend(source, target, transform, cut)
-        steps = steps + taken
+
+    def stage(transform, cut):
+        transform, steps, settled = _descend(source, target, transform, cut)
+        return transform, (steps, settled)
+
+    # a scan, so that the stages share one compiled loop
+    transform, (steps, settled) = lax.scan(stage, initial, jnp.array(cuts, initial.dtype))
     before, after = (score(source, target, t, cuts[-1]) for t in (initial, transform))
     improved = after <= before
-    return Refinement(jnp.where(improved, transform, initial), improved, converged, steps)
+    return Refinement(
+        jnp.where(improved, transform, initial), improved, settled[-1], jnp.sum(steps)
+    )
 
 
 def score(

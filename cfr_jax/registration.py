@@ -91,8 +91,9 @@ def prepare(
 ) -> Cloud:
     """A `Cloud` from raw points (n, 3), or points and normals (n, 6).
 
-    Missing normals are estimated (`normals.estimate_normals`); missing neighbors are searched on the
-    device. Fewer than K + 1 points have fewer neighbors each. Raises ValueError on wrong shapes.
+    Missing normals are estimated (`normals.estimate_normals`); missing neighbors are searched on
+    the device. Fewer than K + 1 points have fewer neighbors each. Raises ValueError on wrong
+    shapes.
     """
     _check_points("points", points)
     n = points.shape[0]

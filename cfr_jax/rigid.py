@@ -1,7 +1,7 @@
 """Rigid motions of 3D space: fitting, composing, and measuring them.
 
-A motion is a (4, 4) matrix `T` acting on column vectors, `T @ [x; 1]`, and is named by what it does:
-`transform` maps source onto target. Twists are (6,) vectors, rotation vector first, then the
+A motion is a (4, 4) matrix `T` acting on column vectors, `T @ [x; 1]`, and is named by what it
+does: `transform` maps source onto target. Twists are (6,) vectors, rotation vector first, then the
 translation part, with `exp` the matrix exponential of SE(3) (Murray, Li & Sastry, 1994, ch. 2).
 
 Everything here states full float32 precision for its products: on accelerators that would otherwise
@@ -20,7 +20,9 @@ from cfr_jax.eigen import symmetric_eigen
 _HIGHEST = lax.Precision.HIGHEST
 
 
-def from_parts(rotation: Float[Array, "3 3"], translation: Float[Array, " 3"]) -> Float[Array, "4 4"]:
+def from_parts(
+    rotation: Float[Array, "3 3"], translation: Float[Array, " 3"]
+) -> Float[Array, "4 4"]:
     """The motion x -> rotation @ x + translation."""
     top = jnp.concatenate([rotation, translation[:, None]], axis=1)
     return jnp.concatenate([top, jnp.array([[0, 0, 0, 1]], top.dtype)], axis=0)
@@ -53,9 +55,10 @@ def fit_rigid(
     """Rigid motion carrying `source` onto `target`, row by row.
 
     Minimizes sum_n weights_n |R source_n + t - target_n|^2 (Kabsch, 1976; Umeyama, 1991) with the
-    weights normalized by their sum + 1e-5, as the paper does. Weights are non-negative; the rotation
-    is proper. Where the minimizer is not unique (collinear or identical points, zero weights) the
-    answer is one of them, and the gradient is zero in the directions that nothing determines.
+    weights normalized by their sum + 1e-5, as the paper does. Weights are non-negative; the
+    rotation is proper. Where the minimizer is not unique (collinear or identical points, zero
+    weights) the answer is one of them, and the gradient is zero in the directions that nothing
+    determines.
     """
     weights = weights / (jnp.sum(weights) + 1e-5)
     # The rotation does not change with the scale of either cloud: bringing both to about one keeps
@@ -82,8 +85,9 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """The proper rotation R that maximizes trace(R^T matrix).
 
     Horn (1987): the quaternion of R is the leading eigenvector of a symmetric 4x4 matrix linear in
-    `matrix`. Reflections need no case of their own, Jacobi rotations always return a unit vector, and
-    no step divides by a singular value: every finite matrix has an answer (zero gives the identity).
+    `matrix`. Reflections need no case of their own, Jacobi rotations always return a unit vector,
+    and no step divides by a singular value: every finite matrix has an answer (zero gives the
+    identity).
 
     The derivative does not pass through the eigenvectors. With P = R^T matrix (symmetric at the
     optimum), dR = R [w]x where (tr(P) I - P) w = vee(R^T dmatrix - dmatrix^T R). That system is
@@ -91,9 +95,7 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     to the largest singular value, so that the gradient stays finite at every scale.
     """
     largest = jnp.max(jnp.abs(matrix))
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = (
-        matrix / jnp.where(largest > 0, largest, 1)
-    ).reshape(9)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = (matrix / jnp.where(largest > 0, largest, 1)).reshape(9)
     horn = jnp.array(
         [
             [xx + yy + zz, zy - yz, xz - zx, yx - xy],
@@ -201,13 +203,11 @@ def to_quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, " 4"]:
     return jnp.where(row[0] < 0, -row, row)
 
 
-def rotation_error(
-    transform: Float[Array, "4 4"], truth: Float[Array, "4 4"]
-) -> Float[Array, ""]:
+def rotation_error(transform: Float[Array, "4 4"], truth: Float[Array, "4 4"]) -> Float[Array, ""]:
     """Angle in degrees between the rotations of two motions.
 
-    By the chord |R - R_truth|, accurate down to float32's 1e-5 degrees, where the usual arccos of the
-    trace loses everything below 0.03 degrees.
+    By the chord |R - R_truth|, accurate down to float32's 1e-5 degrees, where the usual arccos of
+    the trace loses everything below 0.03 degrees.
     """
     chord = jnp.sum((transform[:3, :3] - truth[:3, :3]) ** 2)
     half_sine = jnp.sqrt(jnp.where(chord > 0, chord / 8, 0))

@@ -1,10 +1,10 @@
 """Sinkhorn normalization with slack: which source point corresponds to which target point, softly.
 
 A row and a column of ones stand beside the affinities m = exp(log_affinity) and take what has no
-partner; they are never normalized themselves. One pass divides every real row by its sum, then every
-real column by its sum, slack included. The normalized block is diag(u) m diag(v), with
-u <- 1 / (m v + 1) and v <- 1 / (m' u + 1) from v = 1: matrix-vector products only, the block itself
-is read and never rewritten ("log-free", Hisadome & Matsui, 2021; scaling form after Cuturi, 2013).
+partner; they are never normalized themselves. One pass divides every real row by its sum, then
+every real column by its sum, slack included. The normalized block is diag(u) m diag(v), with u <- 1
+/ (m v + 1) and v <- 1 / (m' u + 1) from v = 1: matrix-vector products only, the block itself is
+read and never rewritten ("log-free", Hisadome & Matsui, 2021; scaling form after Cuturi, 2013).
 """
 
 from __future__ import annotations

@@ -34,8 +34,9 @@ class Phase:
 def run(config: ml_collections.ConfigDict, workdir: Path) -> dict:
     """Trains by `config` in `workdir`, going on where a checkpoint there left off.
 
-    Writes `checkpoints/`, `metrics.jsonl` (a line each time something is measured), and `weights.safetensors`
-    (the averaged weights of the best validation so far). Returns the best validation.
+    Writes `checkpoints/`, `metrics.jsonl` (a line each time something is measured), and
+    `weights.safetensors` (the averaged weights of the best validation so far). Returns the best
+    validation.
     """
     workdir.mkdir(parents=True, exist_ok=True)
     corpus = read_corpus(config.data.train)
@@ -95,7 +96,9 @@ def run(config: ml_collections.ConfigDict, workdir: Path) -> dict:
                     if found["rotation_mean"] < best.get("rotation_mean", np.inf):
                         best = {"step": step, **found}
                         weights.save_params(
-                            workdir / "weights.safetensors", state.average, training_notes(config, best)
+                            workdir / "weights.safetensors",
+                            state.average,
+                            training_notes(config, best),
                         )
                     checkpoints.save(state, {"best": best, "config": config.to_dict()})
         log.close()

@@ -78,9 +78,9 @@ def train_step(
 ) -> tuple[TrainState, PairLoss]:
     """One step on a batch of `data.batches`; losses come back averaged over its pairs.
 
-    `pairs_at_once` pairs are vectorized, the rest follow one another: on CPU one at a time keeps the
-    activations in cache and is fastest, an accelerator wants the whole batch. A step whose gradient
-    is not finite changes nothing but `skipped`.
+    `pairs_at_once` pairs are vectorized, the rest follow one another: on CPU one at a time keeps
+    the activations in cache and is fastest, an accelerator wants the whole batch. A step whose
+    gradient is not finite changes nothing but `skipped`.
     """
 
     def loss(params, pair):

@@ -94,7 +94,9 @@ def read_weights(source: str | Path = DEFAULT) -> Weights:
 def _check_shapes(path, tensors):
     stacked = tensors.get("cascade/kernel", np.zeros(0))
     iterations = stacked.shape[0] if stacked.ndim == 3 else 5
-    wanted = jax.eval_shape(functools.partial(init_params, iterations=iterations), jax.random.key(0))
+    wanted = jax.eval_shape(
+        functools.partial(init_params, iterations=iterations), jax.random.key(0)
+    )
     wanted = {name: leaf.shape for name, leaf in flatten_dict(wanted, sep="/").items()}
     found = {name: leaf.shape for name, leaf in tensors.items()}
     for name in sorted(wanted.keys() | found.keys()):

@@ -26,7 +26,8 @@ LAYERS = (
     ("io",),
     ("data", "viewer"),
     ("trainer", "baselines"),
-    ("align",),
+    ("preparation", "confidence"),
+    ("alignment",),
     ("cli",),
     ("__main__",),
 )

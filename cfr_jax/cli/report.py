@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from cfr_jax import __version__
-from cfr_jax.align import Alignment, align
+from cfr_jax.alignment import Alignment, align
 from cfr_jax.io import PointCloud
 from cfr_jax.viewer import Scene
 from cfr_jax.weights import DEFAULT, Weights, read_weights

@@ -31,7 +31,7 @@ class Sampling:
     angle: float = 45.0
     translation: float = 0.5
     any_orientation: float = 0.0
-    """Share of pairs whose shape is first turned at random: CAD models stand upright, scans may not."""
+    """Share of pairs whose shape is first turned at random: CAD models stand upright, scans not."""
     scale: tuple[float, float] = (1.0, 1.0)
     estimated_normals: float = 0.0
     """Share of pairs whose normals are estimated from the noisy points, as most users' are."""
@@ -67,7 +67,7 @@ def draw_pair(corpus: Corpus, index: int, sampling: Sampling, rng: np.random.Gen
 
 
 def batch_at(corpus: Corpus, position: int, size: int, sampling: Sampling, seed: int) -> dict:
-    """The `size` pairs from number `position` of the endless shuffled stream; arrays (size, ...)."""
+    """The `size` pairs from `position` on of the endless shuffled stream; arrays (size, ...)."""
     pairs = []
     for number in range(position, position + size):
         epoch, place = divmod(number, len(corpus))

@@ -1,0 +1,249 @@
+"""`align`: two clouds of one thing, any size, units and offset, and the motion between them."""
+
+from __future__ import annotations
+
+import functools
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from cfr_jax import confidence, preparation, quality, refinement
+from cfr_jax.io import as_point_cloud
+from cfr_jax.normals import estimate_normals
+from cfr_jax.registration import Cloud, Registration, Settings, register
+from cfr_jax.weights import load_params
+
+DEFAULT_BUDGET = 1024
+_SETTINGS = Settings()
+_DISTANCE = refinement.CUTS[-1]
+# Below this the fit hardly suffers when a cloud slides or turns: noisy planes, spheres, cylinders
+# and lines measured at most 0.05 along their free directions (tests/test_quality.py).
+_FREE = 0.08
+_TRUSTED = 0.5
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Answer of `align`; everything in the caller's frame and units."""
+
+    transform: Float[np.ndarray, "4 4"]
+    """Maps source onto target: `transform @ [x; 1]` lies on the target. Float64."""
+    transforms: Float[np.ndarray, "L 4 4"]
+    """What the network answered, one per iteration, before any refinement."""
+    refined: bool
+    """Whether `transform` is the refinement's answer, and not the network's last."""
+    confidence: float
+    """Estimated probability, in [0, 1], that the motion is right to 5 degrees and 0.1 radii."""
+    determined: bool
+    """Whether the clouds determine the motion; false where one slides or turns on the other."""
+    fitness: float
+    """Share of the source that has a target point within `inlier_distance`."""
+    inlier_rmse: float
+    """Root mean square distance of those points."""
+    inlier_distance: float
+    weights: Float[np.ndarray, " n"]
+    """How much of each used source point found a partner, in [0, 1]."""
+    source_rows: Int[np.ndarray, " n"]
+    """Which source points the network saw."""
+    target_rows: Int[np.ndarray, " m"]
+    neighbors: int
+    """Neighbors per point; small clouds have fewer than the usual 64."""
+    warnings: tuple[str, ...]
+    """Why the answer should not be trusted, or what was done differently, in words."""
+    seconds: dict[str, float]
+    """`compile` (zero when a program of this size was there already), `run`, and `total`."""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the motion is determined and more likely right than wrong."""
+        return self.determined and self.confidence >= _TRUSTED
+
+
+def align(
+    source: Any,
+    target: Any,
+    *,
+    params: dict | None = None,
+    refine: bool = True,
+    initial: Float[np.ndarray, "4 4"] | None = None,
+    max_points: int | None = None,
+    seed: int = 0,
+) -> Alignment:
+    """Finds the rigid motion that lays `source` on `target`.
+
+    Clouds are (n, 3) arrays, (n, 6) with normals, paths, or Open3D and trimesh objects. They are
+    centered and scaled in float64, thinned to `max_points` each (default 1,024; `seed` says which),
+    given normals where they have none, registered by the network with `params` (default: the
+    weights that ship) and refined (`refinement.refine`; off with `refine=False`).
+
+    `initial` (4, 4) moves the source close to the target first; without it the centroids are laid
+    on each other. The network is trained for up to 45 degrees about each axis from there. The same
+    call gives the same answer, to the bit, on the same machine.
+
+    Raises ValueError for clouds without extent or with fewer than 3 points, wrong shapes, values
+    that are not finite, and an `initial` that is no rigid motion; `io.CloudFileError` for files.
+    """
+    began = time.perf_counter()
+    clouds = [
+        as_point_cloud(cloud, name=name) for cloud, name in ((source, "source"), (target, "target"))
+    ]
+    for cloud, name in zip(clouds, ("source", "target"), strict=True):
+        if len(cloud.points) < 3:
+            raise ValueError(f"{name}: got {len(cloud.points)} points, wanted at least 3")
+    if initial is not None:
+        initial = _rigid(initial)
+    budget = DEFAULT_BUDGET if max_points is None else max_points
+    if isinstance(budget, bool) or not isinstance(budget, int) or budget < 3:
+        raise ValueError(f"max_points: got {max_points!r}, wanted a whole number of at least 3")
+    params = load_params() if params is None else params
+
+    frames = preparation.unit_frames(*clouds, initial)
+    unit_source, unit_target = (
+        preparation.to_unit(
+            cloud,
+            center,
+            frames.scale,
+            motion,
+            budget=budget,
+            neighbors=_SETTINGS.neighbors,
+            radius=_SETTINGS.radius,
+            seed=seed,
+        )
+        for cloud, center, motion in (
+            (clouds[0], frames.source_center, frames.initial),
+            (clouds[1], frames.target_center, np.eye(4)),
+        )
+    )
+    arguments = (params, _on_device(unit_source), _on_device(unit_target))
+    started = time.perf_counter()
+    program = _program(refine, *_signature(arguments))
+    compiled = time.perf_counter()
+    found = jax.device_get(program(*arguments))
+    done = time.perf_counter()
+
+    determined = bool(found.quality.resistance.min() >= _FREE)
+    probability = confidence.of_alignment(found.clues)
+    neighbors = min(unit_source.neighbors.shape[1], unit_target.neighbors.shape[1])
+    return Alignment(
+        transform=frames.to_caller(found.transform),
+        transforms=frames.to_caller(found.registration.transforms),
+        refined=refine and bool(found.improved),
+        confidence=probability,
+        determined=determined,
+        fitness=float(found.quality.fitness),
+        inlier_rmse=float(found.quality.inlier_rmse) * frames.scale,
+        inlier_distance=_DISTANCE * frames.scale,
+        weights=found.registration.weights[: len(unit_source.rows)].astype(np.float64),
+        source_rows=unit_source.rows,
+        target_rows=unit_target.rows,
+        neighbors=neighbors,
+        warnings=_warnings(determined, found, probability, neighbors),
+        seconds={
+            "compile": compiled - started,
+            "run": done - compiled,
+            "total": time.perf_counter() - began,
+        },
+    )
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Found:
+    """What comes back from the device."""
+
+    registration: Registration
+    transform: Float[jax.Array, "4 4"]
+    improved: Bool[jax.Array, ""]
+    quality: quality.Quality
+    clues: confidence.Clues
+
+
+@functools.partial(jax.jit, static_argnames=("refine",))
+def _solve(params, source, target, *, refine):
+    source, target = _with_normals(source), _with_normals(target)
+    registration = register(params, source, target, settings=_SETTINGS)
+    surfaces = [
+        refinement.Surface(cloud.points, cloud.normals, cloud.mask) for cloud in (source, target)
+    ]
+    transform, improved = registration.transform, jnp.array(False)
+    if refine:
+        refined = refinement.refine(*surfaces, transform)
+        transform, improved = refined.transform, refined.improved
+    measured = quality.measure(*surfaces, transform, _DISTANCE)
+    clues = confidence.gather(registration, *surfaces, transform, measured)
+    return _Found(registration, transform, improved, measured, clues)
+
+
+def _with_normals(cloud):
+    if cloud.normals is not None:
+        return cloud
+    return cloud.replace(normals=estimate_normals(cloud.points, cloud.neighbors, cloud.mask))
+
+
+def _on_device(unit):
+    return Cloud(
+        points=jnp.asarray(unit.points),
+        normals=None if unit.normals is None else jnp.asarray(unit.normals),
+        neighbors=jnp.asarray(unit.neighbors),
+        mask=jnp.asarray(unit.mask),
+    )
+
+
+def _signature(arguments):
+    leaves, structure = jax.tree.flatten(arguments)
+    return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+
+
+@functools.lru_cache(maxsize=64)
+def _program(refine, structure, shapes):
+    """The compiled program for clouds of these sizes, so that compiling can be timed apart."""
+    arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    return _solve.lower(*arguments, refine=refine).compile()
+
+
+def _rigid(initial):
+    matrix = np.asarray(initial, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError(f"initial: got shape {matrix.shape}, wanted a finite (4, 4) matrix")
+    rotation = matrix[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if off > 1e-3 or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise ValueError(
+            "initial: got a matrix that is no rigid motion, wanted a proper rotation "
+            "and a last row 0 0 0 1"
+        )
+    return matrix
+
+
+def _warnings(determined, found, probability, neighbors):
+    warnings = []
+    if not determined:
+        free = found.quality.weakest[int(found.quality.resistance.argmin())]
+        warnings.append(f"the clouds do not determine the motion: they {_describe(free)} freely")
+    if probability < _TRUSTED:
+        warnings.append(
+            f"not to be trusted: confidence {probability:.2f}, "
+            f"{found.quality.fitness:.0%} of the source lies on the target"
+        )
+    if neighbors < _SETTINGS.neighbors:
+        warnings.append(
+            f"small clouds: {neighbors} neighbors per point instead of {_SETTINGS.neighbors}"
+        )
+    return tuple(warnings)
+
+
+def _describe(twist):
+    turn, slide = twist[:3], twist[3:]
+    verb, axis = (
+        ("turn about", turn)
+        if np.linalg.norm(turn) >= np.linalg.norm(slide)
+        else ("slide along", slide)
+    )
+    axis = axis / np.linalg.norm(axis)
+    axis = axis * np.sign(axis[np.abs(axis).argmax()])
+    return f"{verb} ({', '.join(f'{value:.2f}' for value in axis)})"
