@@ -9,9 +9,8 @@ cache.
   channels.
 - One pass over the tiles sums the second layer's output for its statistics.
 - A second pass, the first two norms folded into their weights, sums the third layer's output and
-  keeps
-  its largest and smallest value over the neighbors. The norm and the ReLU are monotonic per channel,
-  so the pooled feature is one of these two, normalized.
+  keeps its largest and smallest value over the neighbors. The norm and the ReLU are monotonic per
+  channel, so the pooled feature is one of these two, normalized.
 
 The gradient is written out for the same reason. Through a norm it is the incoming gradient minus
 its projections on 1 and on the normalized values, and both projections are sums over rows: the last
