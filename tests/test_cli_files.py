@@ -107,10 +107,10 @@ def test_a_pickled_array_is_not_unpickled(tmp_path):
 def jax_cache(monkeypatch):
     """JAX as it starts, without a cache; all settings are put back."""
     names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
-    before = {name: getattr(jax.config, name) for name in names}
+    before = {name: jax.config.values[name] for name in names}
     jax.config.update("jax_compilation_cache_dir", None)
     monkeypatch.delenv("CFR_JAX_CACHE", raising=False)
-    yield lambda: jax.config.jax_compilation_cache_dir
+    yield lambda: jax.config.values["jax_compilation_cache_dir"]
     for name, value in before.items():
         jax.config.update(name, value)
 

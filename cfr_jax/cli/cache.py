@@ -17,7 +17,7 @@ def keep_compiled_programs() -> None:
     import jax
 
     wish = os.environ.get("CFR_JAX_CACHE", "")
-    if wish == "off" or jax.config.jax_compilation_cache_dir is not None:
+    if wish == "off" or jax.config.values["jax_compilation_cache_dir"] is not None:
         return
     try:
         folder = Path(wish) if wish else _user_folder()
