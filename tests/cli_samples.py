@@ -22,16 +22,31 @@ def motion(degrees: float = 20.0, translation=(0.3, -0.1, 0.2)) -> np.ndarray:
     return transform
 
 
+# Corner and two sides of each plate of a chair that has lost a leg: only one motion lays it on
+# itself.
+PLATES = np.array(
+    [
+        [[0.0, 0.0, 0.5], [0.6, 0.0, 0.0], [0.0, 0.5, 0.0]],  # seat
+        [[0.0, 0.0, 0.5], [0.0, 0.5, 0.0], [-0.1, 0.0, 0.6]],  # back
+        [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 0.5]],  # legs
+        [[0.0, 0.5, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 0.5]],
+        [[0.6, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.5]],
+    ]
+)
+
+
 def points(count: int, seed: int) -> np.ndarray:
-    """A lopsided surface that only one motion lays on itself: a sphere with three bumps."""
-    directions = np.random.default_rng(seed).normal(size=(count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    bumps = np.array([[0.8, 0.6, 0.0], [0.0, -0.6, 0.8], [-0.6, 0.0, -0.8]])
-    heights = np.array([0.7, 0.45, 0.25]) * np.exp(8.0 * (directions @ bumps.T - 1.0))
-    return directions * (0.6 + heights.sum(axis=1, keepdims=True))
+    """A sampling of the chair by area."""
+    rng = np.random.default_rng(seed)
+    areas = np.linalg.norm(np.cross(PLATES[:, 1], PLATES[:, 2]), axis=1)
+    corner, first, second = PLATES[rng.choice(len(PLATES), count, p=areas / areas.sum())].swapaxes(
+        0, 1
+    )
+    along, across = rng.uniform(size=(2, count, 1))
+    return corner + along * first + across * second
 
 
-def write_pair(folder: Path, count: int = 300) -> tuple[str, str]:
+def write_pair(folder: Path, count: int = 700) -> tuple[str, str]:
     """Two samplings of one surface, the second moved by `motion()`; their paths."""
     target = points(count + 20, 1) @ motion()[:3, :3].T + motion()[:3, 3]
     io.write(folder / "source.ply", io.PointCloud(points(count, 0)))

@@ -61,7 +61,7 @@ def test_options_reach_align(pair, tmp_path, answering):
     assert code == 0
     assert (call["refine"], call["max_points"], call["seed"]) == (False, 99, 7)
     np.testing.assert_array_equal(call["initial"], cli_samples.motion(5.0))
-    np.testing.assert_allclose(call["source"].points, cli_samples.points(300, 0))
+    np.testing.assert_allclose(call["source"].points, cli_samples.points(700, 0))
 
 
 def test_defaults_are_those_of_align(pair, answering):
@@ -117,10 +117,10 @@ def test_json_on_standard_output_stands_alone_and_fits_its_schema(pair, answerin
     assert document["source"] == {
         "name": "source.ply",
         "path": pair[0],
-        "points": 300,
-        "used": 150,
+        "points": 700,
+        "used": 350,
     }
-    assert document["target"]["used"] == document["target"]["points"] == 320
+    assert document["target"]["used"] == document["target"]["points"] == 720
     assert (document["fitness"], document["inlier_rmse"]) == (0.75, 0.0125)
     assert (document["confidence"], document["trusted"]) == (0.875, True)
     assert document["seconds"] == {"compile": 2.0, "run": 0.25, "total": 2.5}
@@ -163,7 +163,7 @@ def test_an_earlier_answer_is_a_start(pair, tmp_path, answering):
 def test_the_written_source_lies_on_the_target(pair, tmp_path, answering):
     # given, with normals, which turn along
     answering()
-    source = cli_samples.points(300, 0)
+    source = cli_samples.points(700, 0)
     normals = np.random.default_rng(2).normal(size=source.shape)
     io.write(tmp_path / "with_normals.ply", io.PointCloud(source, normals))
 
@@ -305,7 +305,7 @@ def test_the_real_thing_finds_a_known_motion_twice_alike(pair, tmp_path, capsys)
     truth, found = cli_samples.motion(), np.array(first["transform"])
     np.testing.assert_allclose(found, truth, atol=0.03)
     assert first["trusted"] and first["refined"] and len(first["transforms"]) == 5
-    moved = cli_samples.points(300, 0) @ found[:3, :3].T + found[:3, 3]
+    moved = cli_samples.points(700, 0) @ found[:3, :3].T + found[:3, 3]
     np.testing.assert_allclose(np.load(tmp_path / "moved.npy"), moved, atol=1e-12)
     assert capsys.readouterr().err == ""
 
