@@ -161,7 +161,8 @@ def nearest_on_host(
     """`nearest` by a KD-tree, for an (n, 3) cloud in host memory; (n, k) int32.
 
     The tree measures in float64, the network in float32: a few more neighbors than wanted are asked
-    for and measured again in float32, so that ties fall as they do on the device.
+    for and measured again in float32, so that ties fall as they do on the device. (Only where more
+    than a few hundred points tie does the tree choose among them.)
     """
     points = np.asarray(points, np.float32)
     n = len(points)
@@ -169,14 +170,20 @@ def nearest_on_host(
         raise ValueError(
             f"k: got {k} neighbors for a cloud of {n} points, wanted 1 <= k <= {n - 1}"
         )
-    wide = min(n, k + 8)
-    _, found = cKDTree(points).query(points, wide, workers=workers)
-    offset = points[found] - points[:, None]
-    square = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
-    square[found == np.arange(n)[:, None]] = np.inf
-    order = np.lexsort((found, square), axis=1)[:, :k]
-    found = np.take_along_axis(found, order, axis=1)
+    tree = cKDTree(points)
+    found, square = np.empty((n, k), np.int64), np.empty((n, k), np.float32)
+    rows = np.arange(n)
+    for more in (8, 256):  # on a lattice the few are not enough
+        wide = min(n, k + more)
+        near = tree.query(points[rows], wide, workers=workers)[1].reshape(len(rows), wide)
+        offset = points[near] - points[rows, None]
+        away = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
+        farthest = away.max(axis=1)
+        away[near == rows[:, None]] = np.inf
+        order = np.lexsort((near, away), axis=1)[:, :k]
+        found[rows] = np.take_along_axis(near, order, axis=1)
+        square[rows] = np.take_along_axis(away, order, axis=1)
+        rows = rows[square[rows, -1] == farthest] if wide < n else rows[:0]
     if radius is not None:
-        square = np.take_along_axis(square, order, axis=1)
         found = np.where(square <= np.float32(radius) ** 2, found, found[:, :1])
     return found.astype(np.int32)

@@ -218,4 +218,6 @@ def translation_error(
     transform: Float[Array, "4 4"], truth: Float[Array, "4 4"]
 ) -> Float[Array, ""]:
     """Length of the translation of truth^-1 o transform, in the clouds' unit."""
-    return jnp.linalg.norm(transform[:3, 3] - truth[:3, 3])
+    square = jnp.sum((transform[:3, 3] - truth[:3, 3]) ** 2)
+    apart = square > 0  # the derivative used at zero is zero
+    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)

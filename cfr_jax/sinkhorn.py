@@ -43,15 +43,10 @@ def match(
     that no exponential overflows, and its scaling is kept as u e^r. Masked points neither give nor
     take. `passes` is static; differentiates through the passes.
     """
-    if passes < 1:
-        raise ValueError(f"passes: got {passes}, wanted at least 1")
-    if target_mask is not None:
-        log_affinity = jnp.where(target_mask, log_affinity, -jnp.inf)
+    log_affinity = _checked(log_affinity, passes, source_mask, target_mask)
     # the result does not depend on the shift, so it needs no gradient
     shift = lax.stop_gradient(jnp.maximum(jnp.max(log_affinity, axis=1), 0))
     block = jnp.exp(log_affinity - shift[:, None])
-    if source_mask is not None:
-        block = jnp.where(source_mask[:, None], block, 0)
     slack = jnp.exp(-shift)
     tiny = jnp.finfo(block.dtype).tiny
     v = jnp.ones(block.shape[1], block.dtype)
@@ -76,10 +71,7 @@ def match_in_log_space(
     target_mask: Bool[Array, " m"] | None = None,
 ) -> Match:
     """The same by log-sum-exp over the padded block, as RPM-Net published it; slower."""
-    if source_mask is not None:
-        log_affinity = jnp.where(source_mask[:, None], log_affinity, -jnp.inf)
-    if target_mask is not None:
-        log_affinity = jnp.where(target_mask, log_affinity, -jnp.inf)
+    log_affinity = _checked(log_affinity, passes, source_mask, target_mask)
     padded = jnp.pad(log_affinity, ((0, 1), (0, 1)))
     for _ in range(passes):
         rows = nn.logsumexp(padded[:-1], axis=1, keepdims=True)
@@ -90,3 +82,14 @@ def match_in_log_space(
     weights = jnp.sum(block, axis=1)
     targets = jnp.matmul(block, points, precision=_HIGHEST) / (weights + 1e-5)[:, None]
     return Match(weights, targets, jnp.sum(block, axis=0))
+
+
+def _checked(log_affinity, passes, source_mask, target_mask):
+    """Log affinities with masked rows and columns at minus infinity."""
+    if passes < 1:
+        raise ValueError(f"passes: got {passes}, wanted at least 1")
+    if source_mask is not None:
+        log_affinity = jnp.where(source_mask[:, None], log_affinity, -jnp.inf)
+    if target_mask is not None:
+        log_affinity = jnp.where(target_mask, log_affinity, -jnp.inf)
+    return log_affinity

@@ -17,7 +17,6 @@ jaxtyping.install_import_hook("cfr_jax", "beartype.beartype")
 
 
 def pytest_configure(config):
-    config.addinivalue_line("filterwarnings", "error")
     # a cache that cannot be used makes the tests slower and nothing else
     config.addinivalue_line("filterwarnings", "ignore:.*persistent compilation cache:UserWarning")
     jax.config.update("jax_numpy_dtype_promotion", "strict")
