@@ -20,31 +20,15 @@ layer's follow from the pooled values alone, the first layer's from sums of seve
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-EPSILON = 1e-5
+from cfr_jax.layers import Layer, fold, norm_of, projections
+
 _TILE_ROWS = 4096  # rows of 96 floats: 1.5 MB, the activations of one tile in a core's cache
-
-
-class Layer(NamedTuple):
-    """Linear followed by GroupNorm; every leaf may carry gradients."""
-
-    kernel: Float[Array, "i o"]
-    bias: Float[Array, " o"]
-    scale: Float[Array, " o"]
-    shift: Float[Array, " o"]
-
-
-class _Norm(NamedTuple):
-    """GroupNorm with its statistics, per channel: normalized = (z - mean) * rate."""
-
-    mean: Float[Array, " o"]
-    rate: Float[Array, " o"]
 
 
 def pooled_features(
@@ -75,8 +59,8 @@ def _forward(layers, raw, valid, groups):
     tiles, weights = _tiles(raw, valid)
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
 
-    norm_one = _norm(*_moments_of_first(one, raw, valid, rows), groups)
-    kernel_one, bias_one = _fold(one, norm_one)
+    norm_one = norm_of(*_moments_of_first(one, raw, valid, rows), groups)
+    kernel_one, bias_one = fold(one, norm_one)
 
     def statistics(sums, tile):
         raw, weight = tile
@@ -85,8 +69,8 @@ def _forward(layers, raw, valid, groups):
 
     zeros = jnp.zeros((2, two.bias.size), raw.dtype)
     sums, _ = lax.scan(statistics, zeros, (tiles, weights))
-    norm_two = _norm(*_moments(sums, rows, two.bias), groups)
-    kernel_two, bias_two = _fold(two, norm_two)
+    norm_two = norm_of(*_moments(sums, rows, two.bias), groups)
+    kernel_two, bias_two = fold(two, norm_two)
 
     def extremes(sums, tile):
         raw, weight = tile
@@ -96,7 +80,7 @@ def _forward(layers, raw, valid, groups):
         return _add_sums(sums, z, weight), (each.max(1), each.min(1))
 
     sums, (high, low) = lax.scan(extremes, zeros, (tiles, weights))
-    norm_three = _norm(*_moments(sums, rows, three.bias), groups)
+    norm_three = norm_of(*_moments(sums, rows, three.bias), groups)
     high, low = (e.reshape(-1, e.shape[-1])[:n] + three.bias for e in (high, low))
     extreme = jnp.where(three.scale >= 0, high, low)
     normal = (extreme - norm_three.mean) * norm_three.rate
@@ -111,14 +95,14 @@ def _backward(groups, residuals, gradient):
     width = three.bias.size
     tiles, weights = _tiles(raw, valid)
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
-    kernel_first, bias_first = _fold(one, norm_one)
+    kernel_first, bias_first = fold(one, norm_one)
 
     # Third norm: only the extreme of each point receives gradient, so its projections are sums over
     # n.
     alive = normal * three.scale + three.shift > 0
     gradient = jnp.where(alive, gradient, 0) * valid[:, None]
     shift_three, scale_three = gradient.sum(0), (gradient * normal).sum(0)
-    flat_three, tilt_three = _projections(three, shift_three, scale_three, rows, groups)
+    flat_three, tilt_three = projections(three, shift_three, scale_three, rows, groups)
     at_extreme = gradient * three.scale * norm_three.rate
     at_extreme = _cut(at_extreme, tiles.shape[0])
 
@@ -150,7 +134,7 @@ def _backward(groups, residuals, gradient):
     (kernel_three, bias_three, shift_two, scale_two), d_two = lax.scan(
         through_three, sums, (tiles, weights, at_extreme)
     )
-    flat_two, tilt_two = _projections(two, shift_two, scale_two, rows, groups)
+    flat_two, tilt_two = projections(two, shift_two, scale_two, rows, groups)
     gain_one = one.kernel * (one.scale * norm_one.rate)
 
     def through_two(sums, tile):
@@ -176,7 +160,7 @@ def _backward(groups, residuals, gradient):
     # First layer: its normalized output is linear in the raw channels, and so is all that remains.
     slope, offset = one.kernel * norm_one.rate, (one.bias - norm_one.mean) * norm_one.rate
     scale_one = (slope * outer).sum(0) + offset * shift_one
-    flat_one, tilt_one = _projections(one, shift_one, scale_one, rows, groups)
+    flat_one, tilt_one = projections(one, shift_one, scale_one, rows, groups)
     flat_raw = raw.reshape(-1, channels)
     weight = jnp.repeat(valid, k)[:, None]
     total, gram = (weight * flat_raw).sum(0), (weight * flat_raw).T @ flat_raw
@@ -227,30 +211,3 @@ def _moments_of_first(layer, raw, valid, rows):
     centered = (raw - mean) * weight
     covariance = jnp.einsum("nkc,nkd->cd", centered, centered) / rows
     return mean @ layer.kernel + layer.bias, ((covariance @ layer.kernel) * layer.kernel).sum(0)
-
-
-def _norm(mean, variance, groups):
-    """Channel moments joined into group statistics, spread over the channels again."""
-    joined = mean.reshape(groups, -1).mean(1, keepdims=True)
-    spread = ((mean.reshape(groups, -1) - joined) ** 2).mean(1) + variance.reshape(groups, -1).mean(
-        1
-    )
-    size = mean.size // groups
-    rate = lax.rsqrt(jnp.maximum(spread, 0) + EPSILON)
-    return _Norm(jnp.repeat(joined[:, 0], size), jnp.repeat(rate, size))
-
-
-def _fold(layer, norm):
-    """The layer and its norm as one affine map."""
-    gain = layer.scale * norm.rate
-    return layer.kernel * gain, (layer.bias - norm.mean) * gain + layer.shift
-
-
-def _projections(layer, shift, scale, rows, groups):
-    """What a norm takes out of a gradient: its mean, and its mean along the normalized values."""
-    size = shift.size // groups
-    flat, tilt = (
-        jnp.repeat((layer.scale * s).reshape(groups, size).sum(1), size) / (rows * size)
-        for s in (shift, scale)
-    )
-    return flat, tilt

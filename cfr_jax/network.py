@@ -14,7 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from cfr_jax import extraction
+from cfr_jax.extraction import pooled_features
+from cfr_jax.layers import Layer, group_norm
+from cfr_jax.pooling import pooled_layer
 
 CHANNELS = 96
 GROUPS = 8
@@ -42,7 +44,7 @@ class PointFeatures(nn.Module):
         layers, width = [], raw.shape[-1]
         for i in range(3):
             layers.append(
-                extraction.Layer(
+                Layer(
                     kernel=self.param(f"kernel_{i}", _kernel_init, (width, CHANNELS)),
                     bias=self.param(f"bias_{i}", nn.initializers.zeros, (CHANNELS,)),
                     scale=self.param(f"scale_{i}", nn.initializers.ones, (CHANNELS,)),
@@ -50,7 +52,7 @@ class PointFeatures(nn.Module):
                 )
             )
             width = CHANNELS
-        return extraction.pooled_features(tuple(layers), raw, groups=GROUPS, mask=mask)
+        return pooled_features(tuple(layers), raw, groups=GROUPS, mask=mask)
 
 
 class Cascade(nn.Module):
@@ -115,20 +117,36 @@ class AnnealingNet(nn.Module):
         ]
         x = jnp.concatenate(flagged)
         mask = _join_masks(source, target, source_mask, target_mask)
-        for i, (width, groups) in enumerate(((64, 8), (64, 8), (64, 8), (128, 8), (1024, 16))):
-            x = self._layer(f"point_{i}", x, width, groups, mask)
-        # after the ReLU nothing is below zero, so zeros never win where there is a valid point
-        x = jnp.max(x if mask is None else jnp.where(mask[:, None], x, 0), axis=0, keepdims=True)
+        for i, width in enumerate((64, 64, 64, 128)):
+            x = nn.relu(_apply(self._layer(f"point_{i}", x, width), x, GROUPS, mask))
+        x = pooled_layer(self._layer("point_4", x, 1024), x, groups=2 * GROUPS, mask=mask)[None]
         for i, width in enumerate((512, 256)):
-            x = self._layer(f"pair_{i}", x, width, 16, None)
+            x = nn.relu(_apply(self._layer(f"pair_{i}", x, width), x, 2 * GROUPS, None))
         x = nn.softplus(nn.Dense(2 * self.iterations, kernel_init=_kernel_init, name="out")(x)[0])
         return Annealing(beta=x[: self.iterations], alpha=x[self.iterations :])
 
-    def _layer(self, name, x, width, groups, mask):
-        x = nn.Dense(width, kernel_init=_kernel_init, name=f"{name}_dense")(x)
+    def _layer(self, name, x, width):
+        kernel, bias = _Linear(width, name=f"{name}_dense")(x.shape[-1])
         scale = self.param(f"{name}_scale", nn.initializers.ones, (width,))
         shift = self.param(f"{name}_shift", nn.initializers.zeros, (width,))
-        return nn.relu(group_norm(x, scale, shift, groups=groups, mask=mask))
+        return Layer(kernel, bias, scale, shift)
+
+
+class _Linear(nn.Module):
+    """The parameters of a Dense, for those who apply them in their own way."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, inputs: int):
+        kernel = self.param("kernel", _kernel_init, (inputs, self.width))
+        return kernel, self.param("bias", nn.initializers.zeros, (self.width,))
+
+
+def _apply(layer, x, groups, mask):
+    return group_norm(
+        x @ layer.kernel + layer.bias, layer.scale, layer.shift, groups=groups, mask=mask
+    )
 
 
 class CFR(nn.Module):
@@ -145,33 +163,6 @@ class CFR(nn.Module):
         """Touches every part once, so that `init` makes all parameters."""
         features = self.features(raw)
         return self.cascade.at_rest(features, source), self.annealing(source, target)
-
-
-def group_norm(
-    x: Float[Array, "n c"],
-    scale: Float[Array, " c"],
-    shift: Float[Array, " c"],
-    *,
-    groups: int,
-    mask: Bool[Array, " n"] | None = None,
-) -> Float[Array, "n c"]:
-    """GroupNorm of one cloud (Wu & He, 2018): statistics over all valid rows and a group's
-    channels.
-
-    Flax's own takes the first axis for a batch and knows no mask.
-    """
-    n, channels = x.shape
-    grouped = x.reshape(n, groups, channels // groups)
-    if mask is None:
-        where, count = None, n
-    else:
-        where, count = mask[:, None, None], jnp.maximum(jnp.sum(mask, dtype=x.dtype), 1)
-    count = count * (channels // groups)
-    mean = jnp.sum(grouped, axis=(0, 2), keepdims=True, where=where) / count
-    centered = grouped - mean
-    variance = jnp.sum(centered**2, axis=(0, 2), keepdims=True, where=where) / count
-    normal = centered * lax.rsqrt(variance + extraction.EPSILON)
-    return normal.reshape(n, channels) * scale + shift
 
 
 def unit_rows(x: Float[Array, "n c"]) -> Float[Array, "n c"]:

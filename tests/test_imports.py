@@ -16,7 +16,8 @@ PACKAGE = ROOT / "cfr_jax"
 # is put in here first.
 LAYERS = (
     ("eigen",),
-    ("rigid", "neighbors", "normals", "features", "sinkhorn", "extraction"),
+    ("layers",),
+    ("rigid", "neighbors", "normals", "features", "sinkhorn", "extraction", "pooling"),
     ("network",),
     ("registration", "refinement"),
     ("quality",),
@@ -38,7 +39,7 @@ KNOWS_ONLY = {
     "data": {"io", "neighbors"},
     "metrics": set(),
 }
-NUMERICAL_CORE = {name for layer in LAYERS[:5] for name in layer} | {"losses"}
+NUMERICAL_CORE = {name for layer in LAYERS[:6] for name in layer} | {"losses"}
 # Arrays in, arrays out: no files, no configuration, no host program around it.
 CORE_MAY_USE = {
     "__future__", "collections", "dataclasses", "functools", "math", "typing",

@@ -1,0 +1,83 @@
+"""Linear, then GroupNorm: the layer that everything learned here is made of, by its statistics.
+
+GroupNorm (Wu & He, 2018) over all rows of one cloud: each group of channels is brought to mean zero
+and variance one. Flax's own takes the first axis for a batch and knows no mask.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+EPSILON = 1e-5
+
+
+class Layer(NamedTuple):
+    """Parameters of a Linear and the GroupNorm behind it; every leaf may carry gradients."""
+
+    kernel: Float[Array, "i o"]
+    bias: Float[Array, " o"]
+    scale: Float[Array, " o"]
+    shift: Float[Array, " o"]
+
+
+class Norm(NamedTuple):
+    """The statistics of a GroupNorm, per channel: normalized = (z - mean) * rate."""
+
+    mean: Float[Array, " o"]
+    rate: Float[Array, " o"]
+
+
+def group_norm(
+    x: Float[Array, "n c"],
+    scale: Float[Array, " c"],
+    shift: Float[Array, " c"],
+    *,
+    groups: int,
+    mask: Bool[Array, " n"] | None = None,
+) -> Float[Array, "n c"]:
+    """GroupNorm of one cloud; rows where `mask` is false enter no statistic."""
+    n, channels = x.shape
+    grouped = x.reshape(n, groups, channels // groups)
+    if mask is None:
+        where, count = None, jnp.asarray(n, x.dtype)
+    else:
+        where, count = mask[:, None, None], jnp.maximum(jnp.sum(mask), 1).astype(x.dtype)
+    count = count * (channels // groups)
+    mean = jnp.sum(grouped, axis=(0, 2), keepdims=True, where=where) / count
+    centered = grouped - mean
+    variance = jnp.sum(centered**2, axis=(0, 2), keepdims=True, where=where) / count
+    normal = centered * lax.rsqrt(variance + EPSILON)
+    return normal.reshape(n, channels) * scale + shift
+
+
+def norm_of(mean: Float[Array, " o"], variance: Float[Array, " o"], groups: int) -> Norm:
+    """Channel moments joined into group statistics, spread over the channels again."""
+    means = mean.reshape(groups, -1)
+    joined = means.mean(1, keepdims=True)
+    spread = ((means - joined) ** 2).mean(1) + variance.reshape(groups, -1).mean(1)
+    size = mean.size // groups
+    rate = lax.rsqrt(jnp.maximum(spread, 0) + EPSILON)
+    return Norm(jnp.repeat(joined[:, 0], size), jnp.repeat(rate, size))
+
+
+def fold(layer: Layer, norm: Norm) -> tuple[Float[Array, "i o"], Float[Array, " o"]]:
+    """The layer and its norm as one affine map."""
+    gain = layer.scale * norm.rate
+    return layer.kernel * gain, (layer.bias - norm.mean) * gain + layer.shift
+
+
+def projections(
+    layer: Layer, shift: Float[Array, " o"], scale: Float[Array, " o"], rows: Array, groups: int
+) -> tuple[Float[Array, " o"], Float[Array, " o"]]:
+    """What a norm takes out of the gradient that comes into it: its mean over rows and channels of
+    the group, and its mean along the normalized values, from the gradients of shift and scale."""
+    size = shift.size // groups
+    flat, tilt = (
+        jnp.repeat((layer.scale * s).reshape(groups, size).sum(1), size) / (rows * size)
+        for s in (shift, scale)
+    )
+    return flat, tilt
