@@ -44,12 +44,12 @@ clean:
 # The stamps are newer than pyproject.toml as long as what it asks for is installed.
 .venv/.viz: pyproject.toml | .venv/bin/python
 	@echo "installing cfr_jax into .venv (a few minutes the first time)"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[viz]'
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[viz]'
 	@touch $@
 
 .venv/.dev: pyproject.toml | .venv/bin/python
 	@echo "installing cfr_jax and its tools into .venv (a few minutes the first time)"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[dev]'
 	@touch $@ .venv/.viz
 
 # A shim of pyenv may be found and not run, a Debian Python may lack venv: try each one.
