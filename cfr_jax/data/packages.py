@@ -6,14 +6,18 @@ here lets a corpus be built on machines that never heard of dpkg.
 
 from __future__ import annotations
 
+import lzma
 import os
 import shutil
 import subprocess
 import tarfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO
+
+from tqdm import tqdm
 
 _MAGIC = b"!<arch>\n"
 _HEADER = 60  # bytes: name 16, date 12, owner 6, group 6, mode 8, size 10, end mark 2
@@ -54,14 +58,16 @@ def find_deb(package: str, folder: Path) -> Path | None:
     return found[-1] if found else None
 
 
-def extract(deb: Path, wanted: Callable[[str], bool], into: Path) -> list[Path]:
+def extract(
+    deb: Path, wanted: Callable[[str], bool], into: Path, quiet: bool = False
+) -> list[Path]:
     """Writes the regular files of a package whose path (`usr/share/...`) is wanted below `into`.
 
     Returns their paths in the package's order. A file of that size that is already there is kept.
     Raises ValueError where the file is no Debian package, or is cut off.
     """
     written = []
-    with _data_tar(deb) as tar:
+    with _data_tar(deb, quiet) as tar:
         for member in tar:
             inside = PurePosixPath(member.name)
             name = str(inside)
@@ -84,7 +90,7 @@ def extract(deb: Path, wanted: Callable[[str], bool], into: Path) -> list[Path]:
 
 
 @contextmanager
-def _data_tar(deb: Path) -> Iterator[tarfile.TarFile]:
+def _data_tar(deb: Path, quiet: bool) -> Iterator[tarfile.TarFile]:
     try:
         with open(deb, "rb") as stream:
             name = _seek_data(stream, deb)
@@ -94,15 +100,13 @@ def _data_tar(deb: Path) -> Iterator[tarfile.TarFile]:
                     f"{deb}: {name} is packed in a way that Python 3.11 cannot read; repack it "
                     "with `dpkg-deb`, or take the package of Debian 12"
                 )
-            # "r|": one pass over the stream, which ends at the tar's own end mark.
-            with tarfile.open(fileobj=stream, mode=f"r|{kind}") as tar:
-                yield tar
-    except (OSError, EOFError, tarfile.TarError) as error:
+            bar = {"total": deb.stat().st_size, "disable": quiet or None, "unit": "B"}
+            with tqdm.wrapattr(stream, "read", desc=deb.name.split("_")[0], **bar) as counted:
+                # "r|": one pass over the stream, which ends at the tar's own end mark.
+                with tarfile.open(fileobj=counted, mode=f"r|{kind}") as tar:
+                    yield tar
+    except (OSError, EOFError, tarfile.TarError, lzma.LZMAError, zlib.error) as error:
         raise ValueError(f"{deb} is not a whole Debian package: {error}") from error
-    except Exception as error:
-        if type(error).__name__ in ("LZMAError", "error"):  # of lzma and zlib, which tar lets pass
-            raise ValueError(f"{deb} is damaged: {error}") from error
-        raise
 
 
 def _seek_data(stream: IO[bytes], deb: Path) -> str:
@@ -116,5 +120,8 @@ def _seek_data(stream: IO[bytes], deb: Path) -> str:
             raise ValueError(f"{deb}: holds no data.tar, or is cut off")
         name = header[:16].decode("latin1").strip().rstrip("/")
         if name.startswith("data.tar"):
+            # Of a tar that was cut off, the last files would be missed without a word.
+            if stream.tell() + int(size) > os.fstat(stream.fileno()).st_size:
+                raise ValueError(f"{deb} is cut off: {name} wants {int(size)} bytes")
             return name
         stream.seek(int(size) + int(size) % 2, os.SEEK_CUR)

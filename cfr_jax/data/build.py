@@ -1,0 +1,258 @@
+"""Builds a corpus from meshes: each sampled, judged, held against the others, written to HDF5.
+
+What is written depends on the meshes and their names alone. The samples are kept beside the result
+while the work goes on, so an interrupted build resumes where it stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import h5py
+import numpy as np
+from tqdm import tqdm
+
+from cfr_jax.data.duplicates import drop_duplicates
+from cfr_jax.data.meshes import SUFFIXES, read_mesh
+from cfr_jax.data.shapes import Shape, Unfit, make_shape, name_share
+from cfr_jax.io.mesh import Mesh
+
+RECIPE = "1"  # counted up when the same meshes would give another corpus
+VALIDATION_SHARE = 0.2
+SPLITS = ("train", "val", "test")
+_BLOCK = 64  # shapes sampled between two saves
+
+
+@dataclass(frozen=True)
+class Item:
+    """One mesh on its way into a corpus."""
+
+    name: str  # unique; decides the random numbers and the split
+    category: str
+    load: Callable[[], Mesh]
+    least_faces: int = 20
+    stamp: str = ""  # changes when the file does
+
+
+@dataclass
+class Report:
+    """What came of a build."""
+
+    counts: dict[str, Counter[str]] = field(default_factory=dict)  # split → category → shapes
+    left_out: dict[str, str] = field(default_factory=dict)  # name → why
+
+    @property
+    def shapes(self) -> int:
+        return sum(sum(counts.values()) for counts in self.counts.values())
+
+    @property
+    def reasons(self) -> Counter[str]:
+        """How many shapes were left out for what; of `repeats OTHER` only the first word."""
+        return Counter(
+            "repeats another" if why.startswith("repeats ") else why
+            for why in self.left_out.values()
+        )
+
+
+def folder_items(folder: Path, least_faces: int = 20) -> list[Item]:
+    """Every mesh below a folder, its first folder for a category (the folder's name if none).
+
+    Raises ValueError where there is none.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"no folder {folder} to take meshes from")
+    paths = sorted(
+        path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()
+    )
+    if not paths:
+        raise ValueError(f"no mesh below {folder}: wanted files that end in {' '.join(SUFFIXES)}")
+    items = []
+    for path in paths:
+        inside = path.relative_to(folder)
+        category = inside.parts[0] if len(inside.parts) > 1 else folder.resolve().name
+        stat = path.stat()
+        items.append(
+            Item(
+                name=inside.as_posix(),
+                category=category,
+                load=lambda path=path: read_mesh(path),
+                least_faces=least_faces,
+                stamp=f"{stat.st_size} {stat.st_mtime_ns}",
+            )
+        )
+    return items
+
+
+def choose_unseen(categories: Sequence[str]) -> tuple[str, ...]:
+    """Half of the categories (rounded down), by a hash of their names."""
+    shuffled = sorted(set(categories), key=lambda category: name_share(category, "half"))
+    return tuple(sorted(shuffled[: len(shuffled) // 2]))
+
+
+def split_of(name: str, unseen: bool) -> str:
+    """Shapes of unseen categories are for the test; of the others the name's hash picks a fifth
+    for validation."""
+    if unseen:
+        return "test"
+    return "val" if name_share(name, "split") < VALIDATION_SHARE else "train"
+
+
+def build(
+    items: Sequence[Item],
+    out: Path,
+    unseen: Sequence[str] | None,
+    points: int = 2048,
+    quiet: bool = False,
+) -> Report:
+    """Writes a corpus: `train.h5`, `val.h5`, `test.h5` into the folder `out`, or all shapes into
+    one file `out` if `unseen` is None. `shape_names.txt` comes beside.
+
+    Raises ValueError where no item is fit, or where items share a name.
+    """
+    categories = sorted({item.category for item in items})
+    unknown = sorted(set(unseen or ()) - set(categories))
+    if unknown:
+        raise ValueError(f"unseen: no mesh is of the categories {unknown}; there are {categories}")
+    repeated = [name for name, times in Counter(item.name for item in items).items() if times > 1]
+    if repeated:
+        raise ValueError(f"items: {len(repeated)} names occur twice, {repeated[0]!r} for one")
+
+    work = out.with_name(f".{out.name}.work")
+    report = Report()
+    kept: list[Item] = []
+    shapes: list[Shape] = []
+    for item, made in _sampled(items, points, work, quiet):
+        if isinstance(made, str):
+            report.left_out[item.name] = made
+        else:
+            kept.append(item)
+            shapes.append(made)
+
+    def bar(pairs):
+        return tqdm(pairs, desc="comparing", unit=" pairs", disable=True if quiet else None)
+
+    dropped = drop_duplicates(shapes, [i.category not in (unseen or ()) for i in kept], bar)
+    for row, other in dropped.items():
+        report.left_out[kept[row].name] = f"repeats {kept[other].name}"
+    # An order by hash, so that the first rows are a fair sample of the whole.
+    rows = sorted(
+        (row for row in range(len(kept)) if row not in dropped),
+        key=lambda row: name_share(kept[row].name, "order"),
+    )
+    if not rows:
+        raise ValueError(f"none of {len(items)} meshes is fit for a corpus: {dict(report.reasons)}")
+
+    single = unseen is None
+    folder = out.parent if single else out
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_text(folder / "shape_names.txt", "".join(f"{name}\n" for name in categories))
+    for split in ("all",) if single else SPLITS:
+        chosen = [
+            row for row in rows
+            if single or split == split_of(kept[row].name, kept[row].category in unseen)
+        ]  # fmt: skip
+        report.counts[split] = Counter(kept[row].category for row in chosen)
+        if chosen:  # a corpus of no shapes is no corpus
+            path = out if single else out / f"{split}.h5"
+            _write_corpus(path, [kept[row] for row in chosen], [shapes[row] for row in chosen],
+                          categories, split)  # fmt: skip
+    shutil.rmtree(work, ignore_errors=True)
+    return report
+
+
+def _sampled(
+    items: Sequence[Item], points: int, work: Path, quiet: bool
+) -> Iterator[tuple[Item, Shape | str]]:
+    """Each item with its shape, or with the reason why it is none; saved block by block."""
+    plan = [RECIPE, points, [(i.name, i.least_faces, i.stamp) for i in items]]
+    digest = hashlib.sha256(json.dumps(plan).encode()).hexdigest()
+    folder = work / digest[:16]
+    if work.is_dir():  # samples of other meshes than these
+        for other in work.glob("[0-9a-f]" * 16):
+            if other != folder:
+                shutil.rmtree(other)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tqdm(total=len(items), desc="sampling", unit=" meshes", disable=quiet or None) as bar:
+        for start in range(0, len(items), _BLOCK):
+            block = items[start : start + _BLOCK]
+            path = folder / f"{start:06d}.npz"
+            if not path.is_file():
+                _save_block(path, [_attempt(item, points, bar) for item in block], points)
+            else:
+                bar.update(len(block))
+            yield from zip(block, _load_block(path), strict=True)
+
+
+def _attempt(item: Item, points: int, bar: tqdm) -> Shape | str:
+    try:
+        return make_shape(item.load(), item.name, points, item.least_faces)
+    except Unfit as unfit:
+        return str(unfit)
+    except ValueError as error:
+        tqdm.write(f"left out: {error}") if not bar.disable else None
+        return "cannot be read"
+    finally:
+        bar.update(1)
+
+
+def _save_block(path: Path, made: Sequence[Shape | str], points: int) -> None:
+    shapes = [one for one in made if isinstance(one, Shape)]
+    beside = path.with_suffix(".part")
+    with open(beside, "wb") as stream:
+        np.savez(
+            stream,
+            reasons=np.array(["" if isinstance(one, Shape) else one for one in made], "U"),
+            points=np.array([s.points for s in shapes], np.float32).reshape(-1, points, 3),
+            normals=np.array([s.normals for s in shapes], np.float32).reshape(-1, points, 3),
+            spacings=np.array([s.spacing for s in shapes], np.float64),
+            fingerprints=np.array([s.fingerprint for s in shapes], "U"),
+        )
+    os.replace(beside, path)
+
+
+def _load_block(path: Path) -> Iterator[Shape | str]:
+    with np.load(path, allow_pickle=False) as saved:
+        columns = ("points", "normals", "spacings", "fingerprints")
+        shapes = zip(*(saved[column] for column in columns), strict=True)
+        for reason in saved["reasons"].tolist():
+            if reason:
+                yield reason
+            else:
+                points, normals, spacing, fingerprint = next(shapes)
+                yield Shape(points, normals, float(spacing), str(fingerprint))
+
+
+def _write_corpus(
+    path: Path, items: Sequence[Item], shapes: Sequence[Shape], categories: list[str], split: str
+) -> None:
+    """The layout of `modelnet40_ply_hdf5_2048`, with names, half-precision points, int8 normals."""
+    data = np.stack([shape.points for shape in shapes]).astype(np.float16)
+    normal = np.round(np.stack([shape.normals for shape in shapes]) * 127).astype(np.int8)
+    labels = np.array([[categories.index(item.category)] for item in items])
+    chunks = (min(32, len(data)), *data.shape[1:])
+    beside = path.with_name(f".{path.name}.part")
+    # No times and no tracking of anything: the same corpus is the same bytes.
+    with h5py.File(beside, "w", libver="v110", track_order=False) as file:
+        packed = {"chunks": chunks, "compression": "gzip", "track_times": False}
+        file.create_dataset("data", data=data, **packed)
+        file.create_dataset("normal", data=normal, **packed).attrs["scale"] = 1 / 127
+        kind = np.uint8 if len(categories) <= 256 else np.uint16
+        file.create_dataset("label", data=labels.astype(kind), track_times=False)
+        names = [item.name for item in items]
+        file.create_dataset("names", data=names, dtype=h5py.string_dtype(), track_times=False)
+        file.attrs["split"] = split
+        file.attrs["recipe"] = RECIPE
+    os.replace(beside, path)
+
+
+def _write_text(path: Path, text: str) -> None:
+    beside = path.with_name(f".{path.name}.part")
+    beside.write_text(text)
+    os.replace(beside, path)

@@ -1,0 +1,139 @@
+"""From a mesh to a shape of a corpus: cleaned, judged, sampled by area, scaled to the unit sphere.
+
+Everything random is seeded by the shape's name, so a corpus does not depend on the order or the
+number of its shapes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from scipy.spatial import cKDTree
+
+from cfr_jax.io.mesh import Mesh
+
+FLATTEST = 0.05  # least share of the smallest extent in the largest
+DENSEST = 0.2  # least median distance to the mean, of a shape with largest norm 1
+GRID = 1e-3  # on which vertices of exact duplicates agree, for a shape with largest norm 1
+
+
+class Unfit(ValueError):
+    """The mesh is no shape for a corpus; the message says why, in the same words for all alike."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """Points in the unit sphere about their mean, with unit normals of the faces they lie on."""
+
+    points: Float32[np.ndarray, "p 3"]
+    normals: Float32[np.ndarray, "p 3"]
+    spacing: float  # mean distance to the nearest point of a second sample of the same mesh
+    fingerprint: str  # equal for meshes whose vertices are equal but for place and scale
+
+
+def make_shape(mesh: Mesh, name: str, points: int = 2048, least_faces: int = 20) -> Shape:
+    """Samples a mesh, or raises `Unfit`.
+
+    A mesh is fit if it has `least_faces` faces with an area, if its smallest extent is at least 5 %
+    of its largest in the axes of the file and in the principal axes, and if the median distance of
+    its points to their mean is at least a fifth of the largest.
+    """
+    corners = clean_triangles(mesh)
+    if len(corners) < least_faces:
+        raise Unfit(f"fewer than {least_faces} faces with an area")
+    vertices = corners.reshape(-1, 3)
+    if _flatness(vertices) < FLATTEST:
+        raise Unfit("flat")
+    sampled, normals = sample_triangles(corners, points, name_generator(name, "sample"))
+    # Principal axes of the surface, not of the vertices, which crowd where there is detail.
+    axes = np.linalg.eigh(np.cov(sampled.T))[1]
+    if _flatness(vertices @ axes) < FLATTEST:
+        raise Unfit("flat")
+    center = sampled.mean(axis=0)
+    radius = np.linalg.norm(sampled - center, axis=1).max()
+    unit = (sampled - center) / radius
+    if np.median(np.linalg.norm(unit, axis=1)) < DENSEST:
+        raise Unfit("concentrated about one place")
+    again, _ = sample_triangles(corners, points, name_generator(name, "second sample"))
+    spacing = mean_nearest(unit, (again - again.mean(axis=0)) / radius)
+    return Shape(
+        unit.astype(np.float32), normals.astype(np.float32), spacing, _fingerprint(vertices)
+    )
+
+
+def name_generator(name: str, purpose: str) -> np.random.Generator:
+    """The random numbers of one shape for one purpose, on every machine the same."""
+    digest = hashlib.sha256(f"{purpose}\n{name}".encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:16], "little"))
+
+
+def name_share(name: str, purpose: str) -> float:
+    """A number in [0, 1), uniform over names: what a rule on the name decides by."""
+    digest = hashlib.sha256(f"{purpose}\n{name}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") / 2**64
+
+
+def clean_triangles(mesh: Mesh) -> Float64[np.ndarray, "t 3 3"]:
+    """Corners of the triangles that are finite and have an area; raises Unfit if there is none."""
+    vertices = np.asarray(mesh.vertices, np.float64).reshape(-1, 3)
+    triangles = mesh.triangles
+    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
+        raise Unfit("a face names a vertex that is not there")
+    corners = vertices[triangles]
+    corners = corners[np.isfinite(corners).all(axis=(1, 2))]
+    if len(corners) == 0:
+        raise Unfit("no faces")
+    extent = np.ptp(corners.reshape(-1, 3), axis=0).max()
+    if not 0 < extent < 1e12:
+        raise Unfit("no extent, or none that is a number")
+    fit: Bool[np.ndarray, " t"] = _areas(corners / extent)[0] > 1e-14
+    if not fit.any():
+        raise Unfit("no faces")
+    return corners[fit]
+
+
+def sample_triangles(
+    corners: Float64[np.ndarray, "t 3 3"], count: int, rng: np.random.Generator
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+    """Points uniform over the area, and the unit normals of the triangles they lie on."""
+    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    areas, normals = _areas(corners)
+    cumulative = np.cumsum(areas)
+    chosen: Int64[np.ndarray, " n"] = np.searchsorted(
+        cumulative, rng.uniform(0.0, cumulative[-1], count), side="right"
+    )
+    # The square root spreads evenly over a triangle what is drawn along its height.
+    along, across = np.sqrt(rng.uniform(size=(count, 1))), rng.uniform(size=(count, 1))
+    points = a[chosen] + along * ((1 - across) * ab[chosen] + across * ac[chosen])
+    return points, normals[chosen]
+
+
+def _areas(
+    corners: Float64[np.ndarray, "t 3 3"],
+) -> tuple[Float64[np.ndarray, " t"], Float64[np.ndarray, "t 3"]]:
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    double = np.linalg.norm(cross, axis=1)
+    return double / 2, cross / np.where(double > 0, double, 1.0)[:, None]
+
+
+def _flatness(points: Float64[np.ndarray, "n 3"]) -> float:
+    extents = np.ptp(points, axis=0)
+    return float(extents.min() / extents.max())
+
+
+def mean_nearest(points: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m 3"]) -> float:
+    """Mean distance to the nearest point of the other cloud, the mean of both directions."""
+    forth = cKDTree(others).query(points)[0].mean()
+    return float(forth + cKDTree(points).query(others)[0].mean()) / 2
+
+
+def _fingerprint(vertices: Float64[np.ndarray, "v 3"]) -> str:
+    unique = np.unique(vertices, axis=0)
+    centered = unique - unique.mean(axis=0)
+    scaled = centered / np.linalg.norm(centered, axis=1).max()
+    # Adding zero turns -0. into 0., which has other bytes.
+    rounded = np.unique(np.round(scaled / GRID) + 0.0, axis=0)
+    return hashlib.sha256(rounded.tobytes()).hexdigest()
