@@ -79,6 +79,7 @@ def _forward(layers, raw, valid, groups):
         each = z.reshape(-1, k, z.shape[-1])
         return _add_sums(sums, z, weight), (each.max(1), each.min(1))
 
+    zeros = jnp.zeros((2, three.bias.size), raw.dtype)
     sums, (high, low) = lax.scan(extremes, zeros, (tiles, weights))
     norm_three = norm_of(*_moments(sums, rows, three.bias), groups)
     high, low = (e.reshape(-1, e.shape[-1])[:n] + three.bias for e in (high, low))
@@ -115,7 +116,7 @@ def _backward(groups, residuals, gradient):
         z = y_two @ three.kernel + three.bias
         signed = (z * jnp.where(three.scale >= 0, 1, -1)).reshape(-1, k, width)
         chosen = signed == signed.max(1, keepdims=True)
-        share = incoming / jnp.sum(chosen, axis=1)
+        share = incoming / jnp.sum(chosen, axis=1, dtype=incoming.dtype)
         sparse = jnp.where(chosen, share[:, None], 0).reshape(z.shape)
         dense = flat_three + tilt_three * ((z - norm_three.mean) * norm_three.rate)
         d_z = sparse - dense * norm_three.rate * weight[:, None]
@@ -129,8 +130,8 @@ def _backward(groups, residuals, gradient):
         )
         return sums, d_n
 
-    vector = jnp.zeros(width, raw.dtype)
-    sums = (jnp.zeros((width, width), raw.dtype), vector, vector, vector)
+    zeros_of = [jax.tree.map(jnp.zeros_like, layer) for layer in layers]
+    sums = (zeros_of[2].kernel, zeros_of[2].bias, zeros_of[1].bias, zeros_of[1].bias)
     (kernel_three, bias_three, shift_two, scale_two), d_two = lax.scan(
         through_three, sums, (tiles, weights, at_extreme)
     )
@@ -153,7 +154,7 @@ def _backward(groups, residuals, gradient):
         )
         return sums, d_y @ gain_one.T
 
-    sums = (jnp.zeros((width, width), raw.dtype), vector, vector, jnp.zeros_like(one.kernel))
+    sums = (zeros_of[1].kernel, zeros_of[1].bias, zeros_of[0].bias, zeros_of[0].kernel)
     (kernel_two, bias_two, shift_one, outer), d_raw = lax.scan(
         through_two, sums, (tiles, weights, d_two)
     )

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from cfr_jax.extraction import pooled_features
-from cfr_jax.layers import Layer, group_norm
+from cfr_jax.layers import Layer, apply_layer, group_norm
 from cfr_jax.pooling import pooled_layer
 
 CHANNELS = 96
@@ -23,7 +23,7 @@ GROUPS = 8
 RAW_CHANNELS = 7
 
 # What PyTorch's Linear starts from, as the published networks did.
-_kernel_init = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+kernel_init = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 _stacked_init = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform", batch_axis=(0,))
 
 
@@ -45,7 +45,7 @@ class PointFeatures(nn.Module):
         for i in range(3):
             layers.append(
                 Layer(
-                    kernel=self.param(f"kernel_{i}", _kernel_init, (width, CHANNELS)),
+                    kernel=self.param(f"kernel_{i}", kernel_init, (width, CHANNELS)),
                     bias=self.param(f"bias_{i}", nn.initializers.zeros, (CHANNELS,)),
                     scale=self.param(f"scale_{i}", nn.initializers.ones, (CHANNELS,)),
                     shift=self.param(f"shift_{i}", nn.initializers.zeros, (CHANNELS,)),
@@ -118,35 +118,31 @@ class AnnealingNet(nn.Module):
         x = jnp.concatenate(flagged)
         mask = _join_masks(source, target, source_mask, target_mask)
         for i, width in enumerate((64, 64, 64, 128)):
-            x = nn.relu(_apply(self._layer(f"point_{i}", x, width), x, GROUPS, mask))
+            x = nn.relu(
+                apply_layer(self._layer(f"point_{i}", x, width), x, groups=GROUPS, mask=mask)
+            )
         x = pooled_layer(self._layer("point_4", x, 1024), x, groups=2 * GROUPS, mask=mask)[None]
         for i, width in enumerate((512, 256)):
-            x = nn.relu(_apply(self._layer(f"pair_{i}", x, width), x, 2 * GROUPS, None))
-        x = nn.softplus(nn.Dense(2 * self.iterations, kernel_init=_kernel_init, name="out")(x)[0])
+            x = nn.relu(apply_layer(self._layer(f"pair_{i}", x, width), x, groups=2 * GROUPS))
+        x = nn.softplus(nn.Dense(2 * self.iterations, kernel_init=kernel_init, name="out")(x)[0])
         return Annealing(beta=x[: self.iterations], alpha=x[self.iterations :])
 
     def _layer(self, name, x, width):
-        kernel, bias = _Linear(width, name=f"{name}_dense")(x.shape[-1])
+        kernel, bias = Linear(width, name=f"{name}_dense")(x.shape[-1])
         scale = self.param(f"{name}_scale", nn.initializers.ones, (width,))
         shift = self.param(f"{name}_shift", nn.initializers.zeros, (width,))
         return Layer(kernel, bias, scale, shift)
 
 
-class _Linear(nn.Module):
+class Linear(nn.Module):
     """The parameters of a Dense, for those who apply them in their own way."""
 
     width: int
 
     @nn.compact
     def __call__(self, inputs: int):
-        kernel = self.param("kernel", _kernel_init, (inputs, self.width))
+        kernel = self.param("kernel", kernel_init, (inputs, self.width))
         return kernel, self.param("bias", nn.initializers.zeros, (self.width,))
-
-
-def _apply(layer, x, groups, mask):
-    return group_norm(
-        x @ layer.kernel + layer.bias, layer.scale, layer.shift, groups=groups, mask=mask
-    )
 
 
 class CFR(nn.Module):
@@ -166,9 +162,9 @@ class CFR(nn.Module):
 
 
 def unit_rows(x: Float[Array, "n c"]) -> Float[Array, "n c"]:
-    """Rows scaled to length one; a zero row stays zero, with zero gradient."""
+    """Rows scaled to length one; a row shorter than 1e-12 becomes zero, with zero gradient."""
     square = jnp.sum(x * x, axis=-1, keepdims=True)
-    positive = square > 0
+    positive = square > 1e-24  # below, the cube in the derivative would overflow
     return jnp.where(positive, x * lax.rsqrt(jnp.where(positive, square, 1)), 0)
 
 

@@ -101,7 +101,7 @@ def prepare(
         raise ValueError(f"mask: got shape {mask.shape}, wanted ({n},) as there are {n} points")
     if neighbors is not None and (neighbors.ndim != 2 or neighbors.shape[0] != n):
         raise ValueError(f"neighbors: got shape {neighbors.shape}, wanted ({n}, k)")
-    points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
+    points = points.astype(jnp.float64 if points.dtype == jnp.float64 else jnp.float32)
     normals = points[:, 3:] if points.shape[1] == 6 else None
     points = points[:, :3]
     if mask is not None:
