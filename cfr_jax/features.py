@@ -22,12 +22,17 @@ def raw_features(
     neighbors: Int32[Array, "n k"],
     *,
     ppf: PairFeature = "dot",
-) -> Float[Array, "n k 7"]:
-    """CFR's seven channels: the offset to the neighbor (3), then the point-pair feature (4)."""
+    position: bool = False,
+) -> Float[Array, "n k c"]:
+    """Seven channels: the offset to the neighbor (3), then the point-pair feature (4).
+
+    With `position` the point's own coordinates come first, ten channels in all, as in RPM-Net.
+    """
     offset = points[neighbors] - points[:, None]
-    return jnp.concatenate(
-        [offset, pair_feature(offset, normals[:, None], normals[neighbors], ppf=ppf)], axis=-1
-    )
+    channels = [offset, pair_feature(offset, normals[:, None], normals[neighbors], ppf=ppf)]
+    if position:
+        channels.insert(0, jnp.broadcast_to(points[:, None], offset.shape))
+    return jnp.concatenate(channels, axis=-1)
 
 
 def pair_feature(

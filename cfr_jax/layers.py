@@ -54,6 +54,18 @@ def group_norm(
     return normal.reshape(n, channels) * scale + shift
 
 
+def apply_layer(
+    layer: Layer,
+    x: Float[Array, "n i"],
+    *,
+    groups: int,
+    mask: Bool[Array, " n"] | None = None,
+) -> Float[Array, "n o"]:
+    """Linear, then GroupNorm."""
+    z = x @ layer.kernel + layer.bias
+    return group_norm(z, layer.scale, layer.shift, groups=groups, mask=mask)
+
+
 def norm_of(mean: Float[Array, " o"], variance: Float[Array, " o"], groups: int) -> Norm:
     """Channel moments joined into group statistics, spread over the channels again."""
     means = mean.reshape(groups, -1)

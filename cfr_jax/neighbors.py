@@ -64,6 +64,30 @@ def nearest(
     return found.reshape(blocks * rows, k)[:n]
 
 
+def first_in_ball(points: Float[Array, "n 3"], k: int, radius: float) -> Int32[Array, "n k"]:
+    """The first `k` other points, by index, within `radius` of each; what is missing, itself.
+
+    RPM-Net's neighborhoods: not the nearest, and with repeated centers where a ball is sparse. A
+    rigid motion does not change them.
+    """
+    n = points.shape[0]
+    rows = max(1, min(n, _BLOCK // n))
+    blocks = -(-n // rows)
+    queries = jnp.pad(points, ((0, blocks * rows - n), (0, 0)))
+
+    def block(start):
+        row = (start + jnp.arange(rows, dtype=jnp.int32))[:, None]
+        here = lax.dynamic_slice_in_dim(queries, start, rows)
+        square = sum((here[:, axis, None] - points[None, :, axis]) ** 2 for axis in range(3))
+        inside = (square <= radius * radius) & (row != jnp.arange(n, dtype=jnp.int32))
+        rank = jnp.arange(k, dtype=jnp.int32)[None, :]
+        found = _nth_set_bit(_pack(inside), jnp.broadcast_to(rank, (rows, k)))
+        return jnp.where(rank < jnp.sum(inside, axis=1, keepdims=True), found, row)
+
+    found = lax.map(block, rows * jnp.arange(blocks, dtype=jnp.int32))
+    return found.reshape(blocks * rows, k)[:n]
+
+
 def _k_smallest(values: Float[Array, "r n"], k: int) -> Int32[Array, "r k"]:
     """Columns of each row's k smallest non-negative values, in the order of the columns.
 
