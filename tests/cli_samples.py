@@ -62,6 +62,7 @@ def alignment(source: io.PointCloud, target: io.PointCloud, **changes) -> Alignm
         "transforms": np.stack([motion(10.0), motion(19.0)]),
         "refined": True,
         "confidence": 0.875,
+        "clues": {"fitness": 0.75},
         "fitness": 0.75,
         "inlier_rmse": 0.0125,
         "inlier_distance": INLIER_DISTANCE,
