@@ -20,6 +20,7 @@ LAYERS = (
     ("rigid", "neighbors", "normals", "features", "sinkhorn", "extraction", "pooling"),
     ("network",),
     ("registration", "refinement"),
+    ("rpmnet",),
     ("quality",),
     ("losses", "metrics", "weights", "convert"),
     ("training",),
@@ -29,6 +30,7 @@ LAYERS = (
     ("trainer", "baselines"),
     ("preparation", "confidence"),
     ("alignment",),
+    ("evaluation",),
     ("cli",),
     ("__main__",),
 )

@@ -1,0 +1,54 @@
+"""Generalized ICP (Segal, Haehnel & Thrun, 2009), by small_gicp (Koide, 2024)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cfr_jax.baselines.optional import require
+from cfr_jax.baselines.start import Start, initial
+from cfr_jax.io import PointCloud
+
+
+def register(
+    source: PointCloud,
+    target: PointCloud,
+    *,
+    distances: tuple[float, ...],
+    start: Start = "centroid",
+    neighbors: int = 20,
+    iterations: int = 100,
+) -> Float[np.ndarray, "4 4"]:
+    """GICP with a rejection distance that shrinks along `distances`; `iterations` for each.
+
+    The covariance of a point comes from its `neighbors` nearest points; normals are not used.
+    """
+    small_gicp = require("small_gicp")
+    clouds, trees = zip(
+        *(_with_covariances(cloud.points, neighbors) for cloud in (source, target)), strict=True
+    )
+    motion = initial(source, target, start)
+    for distance in distances:
+        # small_gicp's usual tolerances are those of a car: 0.1 degrees and a millimeter
+        motion = small_gicp.align(
+            clouds[1],
+            clouds[0],
+            trees[1],
+            init_T_target_source=motion,
+            registration_type="GICP",
+            max_correspondence_distance=distance,
+            max_iterations=iterations,
+            rotation_epsilon=1e-5,
+            translation_epsilon=1e-5 * distance,
+        ).T_target_source
+    return np.array(motion)
+
+
+def _with_covariances(points: Float[np.ndarray, "n 3"], neighbors: int) -> tuple[Any, Any]:
+    small_gicp = require("small_gicp")
+    cloud = small_gicp.PointCloud(points)
+    tree = small_gicp.KdTree(cloud)
+    small_gicp.estimate_covariances(cloud, tree, num_neighbors=neighbors)
+    return cloud, tree

@@ -1,0 +1,20 @@
+"""Libraries that only the baselines need."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+_WAY_OUT = 'pip install "cfr_jax[baselines]"'
+# Open3D's wheel leaves its system libraries to the system.
+_SYSTEM = "on Debian or Ubuntu also: apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6"
+
+
+def require(module: str) -> ModuleType:
+    """The module, or a ModuleNotFoundError of one line that says how to get it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        hint = f"{_WAY_OUT}; {_SYSTEM}" if module == "open3d" else _WAY_OUT
+        why = str(error).splitlines()[0]
+        raise ModuleNotFoundError(f"{module} is needed ({why}): {hint}", name=module) from None

@@ -1,0 +1,122 @@
+"""All methods of a configuration on its pairs, and the files that tell of it."""
+
+from __future__ import annotations
+
+import datetime
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from cfr_jax.data.pairs import Pair
+from cfr_jax.evaluation import machine
+from cfr_jax.evaluation.datasets import read_pairs
+from cfr_jax.evaluation.measuring import Measured, measure, summarize
+from cfr_jax.evaluation.methods import methods_of
+from cfr_jax.evaluation.records import Records
+from cfr_jax.evaluation.running import run_method
+from cfr_jax.evaluation.tables import write_table
+from cfr_jax.viewer.atomic import write_atomically
+
+
+def compare(
+    config: Any, out: Path, names: Sequence[str] = (), plots: bool = True, command: str = ""
+) -> str:
+    """Runs the methods called `names` (none: all of the config's) and writes into `out`.
+
+    `results.json` holds every pair with every iteration, `table.md` what is returned; plots and
+    galleries lie beside them. `parts/` keeps the answers of each method: the same call goes on
+    where it stopped, and other methods or more pairs can join later. Raises ValueError for a config
+    or data that cannot be used.
+    """
+    methods = methods_of(config, names, config.seed)
+    if plots:
+        from cfr_jax.evaluation.figures import draw_all, new_figure
+        from cfr_jax.evaluation.gallery import draw_gallery
+
+        new_figure(1, 1)  # better missed now than after all methods have run
+    pairs = read_pairs(config.data, config.limit, out / "cache")
+    held = {
+        m.name: run_method(m, pairs, out / "parts" / f"{m.name}.json", config.timeout)
+        for m in methods
+    }
+    run = {name: each for name, each in held.items() if each.missing is None}
+    missing = {name: each.missing for name, each in held.items() if each.missing is not None}
+    measured = [
+        measure(name, each, pairs) for name, each in tqdm(run.items(), "measuring", disable=None)
+    ]
+    numbers = {m.name: summarize(m, config.thresholds, config.seed) for m in measured}
+    about = _about(config, len(pairs), command)
+    table = write_table(measured, numbers, about, missing)
+    results = {
+        "about": about,
+        "missing": missing,
+        "methods": {
+            m.name: {
+                "settings": m.about,
+                "started": m.started,
+                "milliseconds": _number(m.milliseconds()),
+                "numbers": {key: n and n._asdict() for key, n in numbers[m.name].items()},
+                "pairs": _of_pairs(m, run[m.name], pairs),
+            }
+            for m in measured
+        },
+    }
+    write_atomically(out / "results.json", json.dumps(results, indent=1).encode())
+    write_atomically(out / "table.md", table.encode())
+    if plots:
+        draw_all(out / "plots", measured, pairs, about)
+        for m in tqdm(measured, "gallery", disable=None):
+            draw_gallery(out / "gallery" / f"{m.name}.png", m, run[m.name], pairs)
+    return table
+
+
+def _about(config: Any, count: int, command: str) -> dict[str, Any]:
+    return {
+        "title": config.title,
+        "data": _told(config.data),
+        "pairs": count,
+        "seed": config.seed,
+        "unit": config.unit,
+        "thresholds": [list(threshold) for threshold in config.thresholds],
+        "main_threshold": list(config.main_threshold),
+        "limits": list(config.limits),
+        "timeout": config.timeout,
+        "command": command,
+        "commit": machine.commit(),
+        "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "machine": machine.describe(),
+        "versions": machine.versions(),
+    }
+
+
+def _told(data: Any) -> str:
+    return " ".join(f"{key}={value}" for key, value in data.to_dict().items())
+
+
+def _of_pairs(m: Measured, held: Records, pairs: Sequence[Pair]) -> list[dict[str, Any]]:
+    told = []
+    for index, pair in enumerate(pairs):
+        record = held.by_pair[index]
+        told.append(
+            {
+                "index": index,
+                "name": pair.name,
+                "overlap": _number(pair.overlap),
+                "failure": record.failure,
+                "err_r": [_number(value) for value in m.err_r[index]],
+                "err_t": [_number(value) for value in m.err_t[index]],
+                "chamfer": None if m.chamfer is None else _number(m.chamfer[index]),
+                "seconds": record.seconds,
+                "transforms": record.transforms,
+            }
+        )
+    return told
+
+
+def _number(value: float | None) -> float | None:
+    """JSON knows no NaN."""
+    return None if value is None or not np.isfinite(value) else float(value)

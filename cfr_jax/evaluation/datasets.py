@@ -1,0 +1,99 @@
+"""The pairs that a configuration asks for."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from cfr_jax.data import kitti, protocol
+from cfr_jax.data.corpus import Corpus, read_corpus
+from cfr_jax.data.modelnet import read_modelnet40
+from cfr_jax.data.pairs import Pair, open_pairs
+
+_PROTOCOLS = {
+    made.name: made
+    for made in (protocol.clean, protocol.noise, protocol.partial, protocol.low_overlap)
+}
+Make = Callable[[int], Pair]
+
+
+def read_pairs(data: Any, limit: int, cache: Path) -> list[Pair]:
+    """The first `limit` pairs (0: all) of the `data` section of a config, all of them with truth.
+
+    `data.kind` is "corpus", "modelnet40", "kitti", or "pairs", and `data.path` a file or folder.
+    Scans have their refined truths kept in the folder `cache`. Raises ValueError where data is
+    missing, with what the folder should hold, and for a pair without a truth.
+    """
+    kinds = {"corpus": _corpus, "modelnet40": _modelnet40, "kitti": _kitti, "pairs": _pairs}
+    if data.kind not in kinds:
+        raise ValueError(f"data.kind is {data.kind!r}, wanted one of {', '.join(kinds)}")
+    if limit < 0:
+        raise ValueError(f"limit is {limit}, wanted 0 for all pairs, or how many")
+    count, make = kinds[data.kind](data, cache)
+    count = min(limit or count, count)
+    if not count:
+        raise ValueError(f"data: no pair in {data.path}")
+    return [_checked(make(i)) for i in tqdm(range(count), "making pairs", disable=None)]
+
+
+def _corpus(data: Any, cache: Path) -> tuple[int, Make]:
+    return _shapes(read_corpus(data.path), data)
+
+
+def _modelnet40(data: Any, cache: Path) -> tuple[int, Make]:
+    return _shapes(read_modelnet40(data.path, data.split), data)
+
+
+def _shapes(corpus: Corpus, data: Any) -> tuple[int, Make]:
+    if data.protocol not in _PROTOCOLS:
+        raise ValueError(
+            f"data.protocol is {data.protocol!r}, wanted one of {', '.join(_PROTOCOLS)}"
+        )
+    chosen = _PROTOCOLS[data.protocol]
+    return len(corpus), lambda index: protocol.fixed_pair(corpus, index, chosen)
+
+
+def _kitti(data: Any, cache: Path) -> tuple[int, Make]:
+    parts = [
+        kitti.read_pairs(
+            data.path,
+            sequence,
+            cache=cache / f"truths_{sequence}.npz",
+            distance=data.distance,
+            stride=data.stride or None,
+        )
+        for sequence in data.sequences
+    ]
+    places = [(part, index) for part in parts for index in range(len(part))]
+
+    def make(index: int) -> Pair:
+        part, row = places[index]
+        return kitti.scan_pair(part, row, data.points, data.angle, data.translation)
+
+    return len(places), make
+
+
+def _pairs(data: Any, cache: Path) -> tuple[int, Make]:
+    held: Sequence[Pair] = open_pairs(data.path)
+    return len(held), held.__getitem__
+
+
+def _checked(pair: Pair) -> Pair:
+    if pair.transform is None:
+        raise ValueError(f"pair {pair.name} has no true transform to measure against")
+    # Rigid in float64: the angle between rotations rounded to float32 reads up to 0.03 degrees.
+    return dataclasses.replace(pair, transform=nearest_motion(pair.transform))
+
+
+def nearest_motion(transform: np.ndarray) -> np.ndarray:
+    """The (4, 4) motions whose rotations are the closest proper ones; float64, any leading axes."""
+    motion = np.array(transform, np.float64)
+    u, _, vt = np.linalg.svd(motion[..., :3, :3])
+    u[..., :, 2] *= np.linalg.det(u @ vt)[..., None]
+    motion[..., :3, :3] = u @ vt
+    return motion

@@ -1,0 +1,116 @@
+"""From answers to errors, and from errors to the numbers of a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from cfr_jax import metrics
+from cfr_jax.data.pairs import Pair
+from cfr_jax.evaluation.datasets import nearest_motion
+from cfr_jax.evaluation.records import Records
+from cfr_jax.metrics import Statistic
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Errors of one method over P pairs: degrees, and the unit of the clouds. NaN where it failed.
+
+    `chamfer` is None where the pairs know no whole shapes.
+    """
+
+    name: str
+    err_r: Float[np.ndarray, "p i"]
+    """After each iteration the method tells of; the last column is the answer."""
+    err_t: Float[np.ndarray, "p i"]
+    chamfer: Float[np.ndarray, " p"] | None
+    seconds: Float[np.ndarray, " p"]
+    failures: dict[int, str]
+    about: dict[str, Any]
+    started: dict[str, Any] | None
+
+    @property
+    def answered(self) -> Bool[np.ndarray, " p"]:
+        """Where the method gave an answer."""
+        return np.isfinite(self.err_r[:, -1])
+
+    def recalled(self, angle: float, distance: float) -> Bool[np.ndarray, " p"]:
+        """Which pairs are solved to this accuracy; a failure is not."""
+        return metrics.recalled(self.err_r[:, -1], self.err_t[:, -1], angle, distance)
+
+    def milliseconds(self) -> float:
+        """Median over the pairs answered; NaN where there are none."""
+        known = self.seconds[self.answered]
+        return float(np.median(known) * 1e3) if len(known) else np.nan
+
+
+def measure(name: str, records: Records, pairs: Sequence[Pair]) -> Measured:
+    """The errors of what `records` holds of all pairs.
+
+    Estimates are made exactly rigid first, as the truths are: their rounding to float32 would read
+    as hundredths of a degree.
+    """
+    answers = {
+        index: nearest_motion(np.array(record.transforms))
+        for index, record in records.by_pair.items()
+        if record.transforms is not None
+    }
+    iterations = max((len(answer) for answer in answers.values()), default=1)
+    err_r, err_t = np.full((2, len(pairs), iterations), np.nan)
+    chamfer, seconds = np.full((2, len(pairs)), np.nan)
+    for index, estimates in answers.items():
+        pair, told = pairs[index], records.by_pair[index].seconds
+        truths = np.broadcast_to(pair.transform, estimates.shape)
+        err_r[index] = metrics.err_r(estimates, truths)
+        err_t[index] = metrics.err_t(estimates, truths)
+        seconds[index] = np.nan if told is None else told
+        if pair.clean_source is not None and pair.clean_target is not None:
+            chamfer[index] = metrics.chamfer(
+                estimates[-1], pair.source, pair.target, pair.clean_source, pair.clean_target
+            )
+    whole = all(pair.clean_source is not None and pair.clean_target is not None for pair in pairs)
+    return Measured(
+        name=name,
+        err_r=err_r,
+        err_t=err_t,
+        chamfer=chamfer if whole else None,
+        seconds=seconds,
+        failures={k: r.failure for k, r in records.by_pair.items() if r.failure is not None},
+        about=records.made_with,
+        started=records.started,
+    )
+
+
+def summarize(
+    measured: Measured, thresholds: Sequence[tuple[float, float]], seed: int
+) -> dict[str, Statistic | None]:
+    """Mean and median errors over the pairs answered, and recalls over all pairs.
+
+    Each with its bootstrap interval; None where nothing was answered or is not measured.
+    """
+    answered = measured.answered
+    errors = {
+        "err_r": measured.err_r[answered, -1],
+        "err_t": measured.err_t[answered, -1],
+        "chamfer": None if measured.chamfer is None else measured.chamfer[answered],
+    }
+    numbers: dict[str, Statistic | None] = {}
+    for name, values in errors.items():
+        for kind, statistic in (("mean", np.mean), ("median", np.median)):
+            known = values is not None and len(values)
+            numbers[f"{name}_{kind}"] = (
+                metrics.bootstrap(values, statistic, seed=seed) if known else None
+            )
+    for angle, distance in thresholds:
+        hits = measured.recalled(angle, distance).astype(float)
+        numbers[recall_name(angle, distance)] = metrics.bootstrap(hits, seed=seed)
+    return numbers
+
+
+def recall_name(angle: float, distance: float) -> str:
+    """As `metrics.summary` calls it."""
+    return f"recall_{angle:g}deg_{distance:g}"

@@ -1,0 +1,149 @@
+"""What a configuration calls a method, as something a process of its own can make and run."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cfr_jax.baselines import NAMES, baseline
+from cfr_jax.data.pairs import Pair
+from cfr_jax.evaluation.records import code_digest
+from cfr_jax.io import PointCloud
+from cfr_jax.io.cloud import usable_normals
+
+OWN = "cfr"
+TRUTH = "truth"
+_FIELDS = {"use", "options", "threads", "batch", "estimated_normals"}
+# Whose seed changes the answer.
+_DRAWING = {"fgr", "fgr_icp", "ransac"}
+# Files that decide the answers of the peers, and of those methods that are made of our own code.
+_PEERS = ("baselines/*.py", "data/scans.py")
+_OURS = (*_PEERS, "*.py", "evaluation/network.py")
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """What a method says of one pair."""
+
+    transforms: Float[np.ndarray, "i 4 4"]
+    """One for each iteration it tells of; the last is the answer. Maps source onto target."""
+    seconds: float
+    """From clouds in host memory to motions in host memory, without compilation."""
+
+
+Solver = Callable[[Sequence[Pair]], list[Answer]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A row of the table."""
+
+    name: str
+    make: Callable[[], Solver]
+    """Called in the method's own process, so it must be picklable."""
+    about: dict[str, Any]
+    """All that decides the answers, as JSON: what stored answers must have been made with."""
+    batch: int = 1
+    threads: int = 0
+    """How many cores its process may use; 0 for all."""
+
+
+def methods_of(config: Any, names: Sequence[str], seed: int) -> list[Method]:
+    """The methods called `names` (none: all) in `config.methods`, in the order given.
+
+    Each entry says what to `use` (a name of `baselines.NAMES`, "truth", or "cfr") with which
+    `options`; perhaps on how many `threads` and in what `batch`, and whether normals are to be
+    `estimated_normals` even where the pairs have them. Raises ValueError for unknown ones.
+    """
+    unknown = [name for name in names if name not in config.methods]
+    if unknown:
+        raise ValueError(
+            f"methods: {', '.join(unknown)} not in the config, which has "
+            f"{', '.join(config.methods)}"
+        )
+    return [_method(name, config, seed) for name in names or config.methods]
+
+
+def _method(name: str, config: Any, seed: int) -> Method:
+    entry = config.methods[name].to_dict()
+    if set(entry) - _FIELDS or "use" not in entry:
+        raise ValueError(f"methods.{name} has {sorted(entry)}, wanted `use` and any of {_FIELDS}")
+    use, options = entry["use"], dict(entry.get("options", {}))
+    estimated = bool(entry.get("estimated_normals", False))
+    batch, threads = entry.get("batch", 1), entry.get("threads", config.threads)
+    about: dict[str, Any] = {
+        "use": use,
+        "options": dict(options),
+        "estimated_normals": estimated,
+        "batch": batch,
+        "threads": threads,
+        "code": code_digest(*(_OURS if use in (OWN, "gicp_jax") else _PEERS)),
+    }
+    make: Callable[[], Solver]
+    if use == OWN:
+        from cfr_jax.weights import read_weights
+
+        weights = read_weights(config.weights)
+        about |= {"weights": weights.name, "sha256": weights.sha256, "seed": seed}
+        make = functools.partial(
+            _make_own,
+            weights=config.weights,
+            estimated=estimated,
+            batch=batch,
+            seed=seed,
+            **options,
+        )
+    elif use == TRUTH:
+        make = _make_truth
+    elif use in NAMES:
+        if use in _DRAWING:
+            options["seed"] = about["seed"] = seed
+        make = functools.partial(make_baseline, use, options, estimated)
+    else:
+        raise ValueError(f"methods.{name}.use is {use!r}, wanted {OWN}, {TRUTH}, or one of {NAMES}")
+    return Method(name, make, about, batch, threads)
+
+
+def clouds_of(pair: Pair, estimated: bool) -> tuple[PointCloud, PointCloud]:
+    """Source and target, without their normals where these are unusable or not wanted."""
+    return (
+        _cloud("source", pair.source, None if estimated else pair.source_normals),
+        _cloud("target", pair.target, None if estimated else pair.target_normals),
+    )
+
+
+def _cloud(name: str, points: np.ndarray, normals: np.ndarray | None) -> PointCloud:
+    return PointCloud(points, None if normals is None else usable_normals(normals), name)
+
+
+def make_baseline(use: str, options: dict[str, Any], estimated: bool) -> Solver:
+    """A baseline as a solver, pair after pair."""
+    register = baseline(use)
+
+    def solve(pairs: Sequence[Pair]) -> list[Answer]:
+        answers = []
+        for pair in pairs:
+            source, target = clouds_of(pair, estimated)
+            began = time.perf_counter()
+            transform = register(source, target, **options)
+            answers.append(Answer(transform[None], time.perf_counter() - began))
+        return answers
+
+    return solve
+
+
+def _make_truth() -> Solver:
+    """Not a method: what the table must say of a perfect one."""
+    return lambda pairs: [Answer(np.array(pair.transform)[None], 0.0) for pair in pairs]
+
+
+def _make_own(**options: Any) -> Solver:
+    from cfr_jax.evaluation.network import make_network
+
+    return make_network(**options)

@@ -1,0 +1,84 @@
+"""Answers on disk: one file a method while the run goes on, so that it can go on again."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cfr_jax.data.pairs import Pair
+from cfr_jax.viewer.atomic import write_atomically
+
+_PACKAGE = Path(__file__).parents[1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """What became of one pair: an answer or a failure."""
+
+    pair: str
+    """Digest of the pair, so that a changed pair is solved again."""
+    transforms: list | None = None
+    """(i, 4, 4), one per iteration."""
+    seconds: float | None = None
+    failure: str | None = None
+
+
+@dataclasses.dataclass
+class Records:
+    """All of one method, by the number of the pair."""
+
+    made_with: dict[str, Any]
+    started: dict[str, Any] | None = None
+    missing: str | None = None
+    by_pair: dict[int, Record] = dataclasses.field(default_factory=dict)
+
+
+def digest(pair: Pair) -> str:
+    """Changes with the clouds, the normals and the truth."""
+    held = hashlib.sha256()
+    for array in (
+        pair.source,
+        pair.target,
+        pair.source_normals,
+        pair.target_normals,
+        pair.transform,
+    ):
+        held.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
+    return held.hexdigest()[:16]
+
+
+def code_digest(*patterns: str) -> str:
+    """Changes with the files of the package that the patterns name."""
+    held = hashlib.sha256()
+    for path in sorted(path for pattern in patterns for path in _PACKAGE.glob(pattern)):
+        held.update(path.name.encode() + path.read_bytes())
+    return held.hexdigest()[:16]
+
+
+def save(path: Path, records: Records) -> None:
+    """Writes the file whole or not at all; numbers keep all their digits."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = dataclasses.asdict(records)
+    write_atomically(path, json.dumps(content).encode())
+
+
+def load(path: Path, made_with: dict[str, Any], pairs: list[str]) -> Records:
+    """The records that still hold: made with the same, of the pairs with these digests."""
+    fresh = Records(made_with)
+    if not path.exists():
+        return fresh
+    try:
+        content = json.loads(path.read_text())
+        if content["made_with"] != json.loads(json.dumps(made_with)):
+            return fresh
+        kept = {int(k): Record(**record) for k, record in content["by_pair"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is no file of results ({error!r}); remove it") from error
+    fresh.started = content["started"]
+    fresh.by_pair = {k: r for k, r in kept.items() if k < len(pairs) and r.pair == pairs[k]}
+    return fresh

@@ -1,0 +1,96 @@
+"""Runs a method on pairs: in batches, with progress, resuming, and going on after failures."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from cfr_jax.data.pairs import Pair
+from cfr_jax.evaluation import records
+from cfr_jax.evaluation.methods import Answer, Method
+from cfr_jax.evaluation.records import Record, Records
+from cfr_jax.evaluation.worker import Failed, Missing, Worker
+
+_SAVE_EVERY = 5.0  # seconds
+_RIGID = 1e-3  # how far from orthonormal a rotation in float32 may be, generously
+
+
+def run_method(method: Method, pairs: Sequence[Pair], path: Path, timeout: float) -> Records:
+    """The records of all pairs; those that `path` already holds are not made again.
+
+    A method that raises, crashes, takes more than `timeout` seconds or answers no rigid motion has
+    failed on that pair, and goes on with the next. Of a batch that fails, each pair is tried alone.
+    """
+    digests = [records.digest(pair) for pair in pairs]
+    held = records.load(path, method.about, digests)
+    # The method is not told the whole shapes.
+    given = [dataclasses.replace(pair, clean_source=None, clean_target=None) for pair in pairs]
+    todo = [index for index in range(len(pairs)) if index not in held.by_pair]
+    saved = time.monotonic()
+    with (
+        Worker(method) as worker,
+        tqdm(
+            total=len(pairs), desc=method.name, initial=len(pairs) - len(todo), disable=None
+        ) as bar,
+    ):
+        for first in range(0, len(todo), method.batch):
+            rows = todo[first : first + method.batch]
+            try:
+                for row, record in _solve(worker, rows, given, digests, timeout):
+                    held.by_pair[row] = record
+                    if record.failure:
+                        bar.write(f"{method.name} failed on pair {row}: {record.failure}")
+            except Missing as error:
+                held.missing = str(error)
+                bar.write(f"{method.name} is left out: {error}")
+                return held
+            if worker.started and held.started is None:
+                held.started = dataclasses.asdict(worker.started)
+            bar.update(len(rows))
+            if time.monotonic() - saved > _SAVE_EVERY:
+                records.save(path, held)
+                saved = time.monotonic()
+    held.by_pair = dict(sorted(held.by_pair.items()))
+    records.save(path, held)
+    return held
+
+
+def _solve(
+    worker: Worker,
+    rows: Sequence[int],
+    pairs: Sequence[Pair],
+    digests: Sequence[str],
+    timeout: float,
+) -> Iterator[tuple[int, Record]]:
+    try:
+        answers = worker.solve([pairs[row] for row in rows], timeout)
+    except Failed as error:
+        if len(rows) == 1:
+            yield rows[0], Record(digests[rows[0]], failure=str(error))
+            return
+        for row in rows:
+            yield from _solve(worker, [row], pairs, digests, timeout)
+        return
+    for row, answer in zip(rows, answers, strict=True):
+        yield row, _record(digests[row], answer)
+
+
+def _record(pair: str, answer: Answer) -> Record:
+    transforms = np.asarray(answer.transforms, np.float64)
+    if transforms.ndim != 3 or transforms.shape[1:] != (4, 4) or not len(transforms):
+        return Record(pair, failure=f"answered an array {transforms.shape}, wanted (i, 4, 4)")
+    rotations = transforms[:, :3, :3]
+    rigid = (
+        np.isfinite(transforms).all()
+        and np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max() < _RIGID
+        and (np.linalg.det(rotations) > 0).all()
+        and np.abs(transforms[:, 3] - [0, 0, 0, 1]).max() < _RIGID
+    )
+    if not rigid:
+        return Record(pair, failure="answered no rigid motion")
+    return Record(pair, transforms.tolist(), float(answer.seconds))

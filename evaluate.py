@@ -1,0 +1,40 @@
+"""Compares methods: python evaluate.py --config=configs/eval_open_cad.py --out=results/open_cad
+
+Any field of the config can be set on the command line, as in --config.data.protocol=clean. Run the
+same command again and it goes on where it stopped; methods added later join those already run.
+"""
+
+import shlex
+import sys
+from pathlib import Path
+
+from absl import app, flags
+from ml_collections import config_flags
+
+_CONFIG = config_flags.DEFINE_config_file("config", None, "The data, the methods, their settings.")
+_OUT = flags.DEFINE_string("out", None, "Folder for results.json, table.md, plots and gallery.")
+_METHODS = flags.DEFINE_list("methods", [], "Which of the config's methods; all if not given.")
+_WEIGHTS = flags.DEFINE_string("weights", None, "Shipped weights by name, or a .safetensors file.")
+_LIMIT = flags.DEFINE_integer("limit", None, "How many pairs, from the first; 0 for all.")
+_SEED = flags.DEFINE_integer("seed", None, "Of the methods that draw, and of the intervals.")
+_PLOTS = flags.DEFINE_bool("plots", True, "Whether to draw plots and galleries.")
+
+
+def main(_) -> None:
+    """Everything of interest is in `cfr_jax.evaluation`."""
+    from cfr_jax.evaluation.comparison import compare
+
+    config = _CONFIG.value
+    for name, flag in (("weights", _WEIGHTS), ("limit", _LIMIT), ("seed", _SEED)):
+        if flag.value is not None:
+            config[name] = flag.value
+    command = shlex.join(["python", *sys.argv])
+    try:
+        print(compare(config, Path(_OUT.value), _METHODS.value, _PLOTS.value, command))
+    except (ValueError, ModuleNotFoundError) as error:
+        sys.exit(f"evaluate.py: error: {error}")
+
+
+if __name__ == "__main__":
+    flags.mark_flags_as_required(["config", "out"])
+    app.run(main)
