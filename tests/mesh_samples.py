@@ -11,11 +11,16 @@ import numpy as np
 from cfr_jax.io.mesh import Mesh
 
 
-def knot(seed: int, vertices: int = 30, scale: tuple = (1.0, 0.7, 0.5)) -> Mesh:
-    """A lumpy shape: the hull of random points."""
+def knot(
+    seed: int, vertices: int = 30, scale: tuple = (1.0, 0.7, 0.5), corners: bool = False
+) -> Mesh:
+    """A lumpy shape: the hull of random points, or with all of them for corners."""
     from scipy.spatial import ConvexHull
 
-    points = np.random.default_rng(seed).normal(size=(vertices, 3)) * scale
+    points = np.random.default_rng(seed).normal(size=(vertices, 3))
+    if corners:
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points *= scale
     hull = ConvexHull(points)
     triangles = hull.simplices.astype(np.int64)
     a, b, c = (points[triangles[:, corner]] for corner in range(3))

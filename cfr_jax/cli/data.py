@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cfr_jax.cli import outputs
 
@@ -51,7 +51,10 @@ modelnet40_ply_hdf5_2048, or a folder of them.
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
     """Adds `cfr data` with its own commands."""
-    style = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
+    style: dict[str, Any] = {
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+        "allow_abbrev": False,
+    }
     parser = subparsers.add_parser(
         "data", help="corpora of shapes: build one, look at one", description=_DESCRIPTION, **style
     )

@@ -13,6 +13,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -82,7 +83,7 @@ def folder_items(folder: Path, least_faces: int = 20) -> list[Item]:
             Item(
                 name=inside.as_posix(),
                 category=category,
-                load=lambda path=path: read_mesh(path),
+                load=partial(read_mesh, path),
                 least_faces=least_faces,
                 stamp=f"{stat.st_size} {stat.st_mtime_ns}",
             )
@@ -110,13 +111,15 @@ def build(
     unseen: Sequence[str] | None,
     points: int = 2048,
     quiet: bool = False,
+    categories: Sequence[str] | None = None,
 ) -> Report:
     """Writes a corpus: `train.h5`, `val.h5`, `test.h5` into the folder `out`, or all shapes into
     one file `out` if `unseen` is None. `shape_names.txt` comes beside.
 
-    Raises ValueError where no item is fit, or where items share a name.
+    Labels are places among `categories`, sorted; by default those that occur. Raises ValueError
+    where no item is fit, or where items share a name.
     """
-    categories = sorted({item.category for item in items})
+    categories = sorted(set(categories or ()) | {item.category for item in items})
     unknown = sorted(set(unseen or ()) - set(categories))
     if unknown:
         raise ValueError(f"unseen: no mesh is of the categories {unknown}; there are {categories}")
@@ -124,6 +127,7 @@ def build(
     if repeated:
         raise ValueError(f"items: {len(repeated)} names occur twice, {repeated[0]!r} for one")
 
+    held_back = frozenset(unseen or ())
     work = out.with_name(f".{out.name}.work")
     report = Report()
     kept: list[Item] = []
@@ -138,7 +142,7 @@ def build(
     def bar(pairs):
         return tqdm(pairs, desc="comparing", unit=" pairs", disable=True if quiet else None)
 
-    dropped = drop_duplicates(shapes, [i.category not in (unseen or ()) for i in kept], bar)
+    dropped = drop_duplicates(shapes, [item.category not in held_back for item in kept], bar)
     for row, other in dropped.items():
         report.left_out[kept[row].name] = f"repeats {kept[other].name}"
     # An order by hash, so that the first rows are a fair sample of the whole.
@@ -156,7 +160,7 @@ def build(
     for split in ("all",) if single else SPLITS:
         chosen = [
             row for row in rows
-            if single or split == split_of(kept[row].name, kept[row].category in unseen)
+            if single or split == split_of(kept[row].name, kept[row].category in held_back)
         ]  # fmt: skip
         report.counts[split] = Counter(kept[row].category for row in chosen)
         if chosen:  # a corpus of no shapes is no corpus

@@ -15,7 +15,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from cfr_jax.data.build import Item, Report, build
 from cfr_jax.data.furniture import FurnitureLibrary
 from cfr_jax.data.meshes import parse_pmd, read_mesh
 from cfr_jax.data.packages import download, extract, find_deb
+from cfr_jax.io.mesh import Mesh
 
 UNSEEN = (
     "aircraft armour_tack bathroom building_asian building_celtic building_nile commercial "
@@ -87,8 +88,9 @@ def build_open_cad(out: Path, debs: Path | None = None, quiet: bool = False) -> 
             items += source_items(source.package, paths, stack)
         if not items:
             raise ValueError("the packages hold no mesh of a category")
-        report = build(sorted(items, key=lambda item: item.name), out, UNSEEN, quiet=quiet)
-    seen = sorted({item.category for item in items} - set(UNSEEN))
+        items.sort(key=lambda item: item.name)
+        report = build(items, out, UNSEEN, quiet=quiet, categories=categories())
+    seen = [category for category in categories() if category not in UNSEEN]
     (out / "seen_categories.txt").write_text("".join(f"{name}\n" for name in seen))
     (out / "unseen_categories.txt").write_text("".join(f"{name}\n" for name in UNSEEN))
     (out / "left_out.tsv").write_text(
@@ -145,11 +147,13 @@ def source_items(package: str, paths: list[Path], stack: ExitStack) -> Iterator[
             rest = rest.removesuffix(".ac")
             if category := category_of(rule_source, rest):
                 name = f"flightgear-{rule_source}:{rest}"
-                yield Item(name, category, lambda path=path: read_mesh(path))
+                stamp = str(path.stat().st_size)
+                yield Item(name, category, partial(read_mesh, path), stamp=stamp)
 
 
 def _game_items(archive: zipfile.ZipFile) -> Iterator[Item]:
-    for entry in archive.namelist():
+    for info in archive.infolist():
+        entry = info.filename
         inside = entry.removeprefix("art/meshes/").removesuffix(_PMD)
         if not (entry.startswith("art/meshes/") and entry.endswith(_PMD)):
             continue
@@ -159,17 +163,23 @@ def _game_items(archive: zipfile.ZipFile) -> Iterator[Item]:
             yield Item(
                 name,
                 category,
-                lambda entry=entry, name=name: parse_pmd(archive.read(entry), name),
+                partial(_game_mesh, archive, entry, name),
                 least_faces=50,
+                stamp=str(info.CRC),
             )
 
 
+def _game_mesh(archive: zipfile.ZipFile, entry: str, name: str) -> Mesh:
+    return parse_pmd(archive.read(entry), name)
+
+
 def _furniture_items(library: FurnitureLibrary, stem: str) -> Iterator[Item]:
+    stamp = str(library.path.stat().st_size)
     for piece in library.pieces:
         path = f"{stem}/{piece.identifier}"
         if category := category_of("furniture", f"{path}|{piece.name}|{piece.category}"):
             name = f"sweethome3d:{path}"
-            yield Item(name, category, lambda piece=piece: library.mesh(piece))
+            yield Item(name, category, partial(library.mesh, piece), stamp=stamp)
 
 
 def category_of(source: str, path: str) -> str | None:
@@ -178,6 +188,11 @@ def category_of(source: str, path: str) -> str | None:
         if pattern.search(path):
             return None if category == "-" else category
     return None
+
+
+def categories() -> list[str]:
+    """All categories that a rule names, sorted: the labels of the corpus."""
+    return sorted({rule[0] for rules in _rules().values() for rule in rules} - {"-"})
 
 
 @cache

@@ -49,7 +49,8 @@ def write_sheet(path: Path, corpus: Corpus, columns: int = 8) -> None:
             points = points @ view.T
             order = np.argsort(points[:, 2])
             colors = 0.15 + 0.8 * np.abs(normals @ view.T)[order]
-            axes.scatter(*points[order, :2].T, s=0.6, c=colors, linewidths=0)
+            x, y, _ = points[order].T
+            axes.scatter(x, y, s=0.6, c=colors, linewidths=0)
             axes.set(xlim=(-1, 1), ylim=(-1, 1))
             axes.set_axis_off()
     png = io.BytesIO()
