@@ -17,7 +17,7 @@ def get_config() -> ConfigDict:
     # weights depend neither on the points nor on the neighbors (docs/training.md).
     config.phases = (
         {"steps": 3000, "points": 256, "neighbors": 24, "batch": 8},
-        {"steps": 5000, "points": 717, "neighbors": 32, "batch": 8},
+        {"steps": 4000, "points": 717, "neighbors": 32, "batch": 8},
     )
 
     config.sampling = ConfigDict()
