@@ -22,6 +22,8 @@ _BUCKETS = tuple(
     for size in (2**power, 2**power * 4 // 3 // 32 * 32, 2**power * 5 // 3 // 32 * 32)
 )
 _OUTER = 0.995  # this share of the points lies in the unit sphere; stray ones may lie outside
+_STRAY = 4.0  # points so far out are errors of the sensor, and would drown the network
+_FARTHEST = 1e3  # radii between the clouds: float32 holds that with digits to spare
 
 
 @dataclass(frozen=True)
@@ -65,25 +67,28 @@ def unit_frames(
     """Centers and a common scale that bring both clouds into the unit sphere.
 
     Without an initial motion each cloud is centered at its own centroid: any offset between them is
-    taken out. With one, both keep their places relative to the target's centroid.
+    taken out. With one, both keep their places relative to the target's centroid. Raises ValueError
+    for clouds without extent, and for an initial motion that leaves them far apart.
     """
-    moved = source.points
-    if initial is not None:
-        moved = moved @ initial[:3, :3].T + initial[:3, 3]
-    target_center = target.points.mean(axis=0)
-    source_center = moved.mean(axis=0) if initial is None else target_center
-    radii = [
-        np.quantile(np.linalg.norm(points - points.mean(axis=0), axis=1), _OUTER)
-        for points in (moved, target.points)
-    ]
-    scale = float(max(radii))
-    for name, cloud, radius in (("source", source, radii[0]), ("target", target, radii[1])):
-        if not radius > 1e-9 * np.abs(cloud.points).max():
-            raise ValueError(
-                f"{name}: all of its {len(cloud.points)} points lie in one place, "
-                "wanted a cloud with some extent"
-            )
-    return Frames(source_center, target_center, scale, np.eye(4) if initial is None else initial)
+    (source_center, source_radius), (target_center, target_radius) = (
+        _ball(name, cloud.points) for name, cloud in (("source", source), ("target", target))
+    )
+    scale = max(source_radius, target_radius)
+    if initial is None:
+        return Frames(source_center, target_center, scale, np.eye(4))
+    place = initial[:3, :3] @ source_center + initial[:3, 3]
+    away = float(np.abs(place - target_center).max())
+    if not away <= _FARTHEST * scale:
+        raise ValueError(
+            f"initial: leaves the source {away:.3g} away from the target, wanted at most "
+            f"{_FARTHEST * scale:.3g}, which is {_FARTHEST:g} times the radius of the clouds"
+        )
+    # What is off by rounding is made a rotation, about the source's center: far from the origin
+    # the slightest turn about that would move the cloud.
+    exact = np.eye(4)
+    exact[:3, :3] = _orthonormal(initial[:3, :3])
+    exact[:3, 3] = place - exact[:3, :3] @ source_center
+    return Frames(target_center, target_center, scale, exact)
 
 
 def to_unit(
@@ -97,9 +102,14 @@ def to_unit(
     radius: float,
     seed: int,
 ) -> UnitCloud:
-    """At most `budget` points of `cloud`, moved, centered, scaled; with neighbors and padding."""
+    """At most `budget` points of `cloud`, moved, centered, scaled; with neighbors and padding.
+
+    Stray points, more than four radii out, are left out.
+    """
     points = (cloud.points @ motion[:3, :3].T + motion[:3, 3] - center) / scale
-    rows = subsample(points, budget, seed)
+    near = np.linalg.norm(points - np.median(points, axis=0), axis=1) <= _STRAY
+    rows = np.flatnonzero(near)
+    rows = rows[subsample(points[rows], budget, seed)]
     used = points[rows].astype(np.float32)
     count = len(used)
     size = bucket(count) if count > neighbors else count
@@ -115,16 +125,21 @@ def to_unit(
 def subsample(points: Float[np.ndarray, "n 3"], budget: int, seed: int) -> Int[np.ndarray, " m"]:
     """Rows of at most `budget` points, evenly spread: one at random of each voxel of a grid.
 
-    The grid is the finest of a bisection that leaves no fewer voxels than wanted; what is too many
-    is dropped at random. The same seed gives the same rows.
+    The grid is the coarsest of a bisection that fills no fewer voxels than wanted; what is too many
+    is dropped at random. Where the points lie in fewer places than that, all are drawn at random.
+    The same seed gives the same rows.
     """
     n = len(points)
     if n <= budget:
         return np.arange(n)
     rng = np.random.default_rng(seed)
     order = rng.permutation(n)[: 32 * budget]  # enough to find the voxels; bounds the time
-    shuffled = points[order]
-    low, high = 0.0, 2.0 * float(np.abs(shuffled).max())
+    shuffled = points[order] - np.median(points[order], axis=0)
+    # stray points would stretch the grid: they share its outermost voxels
+    reach = float(np.quantile(np.abs(shuffled).max(axis=1), _OUTER))
+    reach = max(reach, np.finfo(np.float64).tiny)
+    shuffled = np.clip(shuffled, -reach, reach)
+    low, high = 0.0, 2.0 * reach
     chosen = np.arange(len(order))
     for _ in range(12):
         voxel = (low + high) / 2
@@ -141,8 +156,24 @@ def bucket(count: int) -> int:
     return next((size for size in _BUCKETS if size >= count), count)
 
 
+def _ball(name, points):
+    """Center and radius of all but the stray points; far ones would pull a plain mean away."""
+    center = points.mean(axis=0)
+    away = np.linalg.norm(points - center, axis=1)
+    center = points[away <= np.quantile(away, _OUTER, method="higher")].mean(axis=0)
+    radius = float(np.quantile(np.linalg.norm(points - center, axis=1), _OUTER))
+    if not radius > 1e-9 * np.abs(points).max():
+        raise ValueError(
+            f"{name}: all of its {len(points)} points lie in one place, "
+            "wanted a cloud with some extent"
+        )
+    return center, radius
+
+
 def _first_of_each_voxel(points, voxel):
-    cells = np.floor(points / voxel).astype(np.int64)
+    # the middle of a voxel lies at zero, as coordinates of flat and symmetric clouds often do:
+    # a border there would let rounding decide
+    cells = np.floor(points / voxel + 0.5).astype(np.int64)
     cells -= cells.min(axis=0)
     extent = cells.max(axis=0) + 1
     keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
