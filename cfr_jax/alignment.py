@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import jax
@@ -39,6 +41,8 @@ class Alignment:
     """Whether `transform` is the refinement's answer, and not the network's last."""
     confidence: float
     """Estimated probability, in [0, 1], that the motion is right to 5 degrees and 0.1 radii."""
+    clues: dict[str, float]
+    """What the confidence was estimated from (`confidence.Clues`)."""
     determined: bool
     """Whether the clouds determine the motion; false where one slides or turns on the other."""
     fitness: float
@@ -86,7 +90,8 @@ def align(
     call gives the same answer, to the bit, on the same machine.
 
     Raises ValueError for clouds without extent or with fewer than 3 points, wrong shapes, values
-    that are not finite, and an `initial` that is no rigid motion; `io.CloudFileError` for files.
+    that are not finite, and an `initial` that is no rigid motion or leaves the clouds far apart;
+    `io.CloudFileError` for files.
     """
     began = time.perf_counter()
     clouds = [
@@ -97,10 +102,13 @@ def align(
             raise ValueError(f"{name}: got {len(cloud.points)} points, wanted at least 3")
     if initial is not None:
         initial = _rigid(initial)
-    budget = DEFAULT_BUDGET if max_points is None else max_points
-    if isinstance(budget, bool) or not isinstance(budget, int) or budget < 3:
-        raise ValueError(f"max_points: got {max_points!r}, wanted a whole number of at least 3")
+    budget = DEFAULT_BUDGET if max_points is None else _whole("max_points", max_points, least=3)
+    seed = _whole("seed", seed, least=0)
     params = load_params() if params is None else params
+    if not isinstance(params, Mapping):
+        raise ValueError(
+            f"params: got a {type(params).__name__}, wanted the parameters of load_params"
+        )
 
     frames = preparation.unit_frames(*clouds, initial)
     unit_source, unit_target = (
@@ -134,6 +142,7 @@ def align(
         transforms=frames.to_caller(found.registration.transforms),
         refined=refine and bool(found.improved),
         confidence=probability,
+        clues={name: float(value) for name, value in vars(found.clues).items()},
         determined=determined,
         fitness=float(found.quality.fitness),
         inlier_rmse=float(found.quality.inlier_rmse) * frames.scale,
@@ -206,8 +215,20 @@ def _program(refine, structure, shapes):
     return _solve.lower(*arguments, refine=refine).compile()
 
 
+def _whole(name, value, *, least):
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name}: got {value!r}, wanted a whole number of at least {least}")
+    return int(value)
+
+
 def _rigid(initial):
-    matrix = np.asarray(initial, np.float64)
+    try:
+        matrix = np.asarray(initial, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"initial: got a {type(initial).__name__} that is no array of numbers, "
+            "wanted a (4, 4) matrix"
+        ) from None
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise ValueError(f"initial: got shape {matrix.shape}, wanted a finite (4, 4) matrix")
     rotation = matrix[:3, :3]
@@ -246,4 +267,5 @@ def _describe(twist):
     )
     axis = axis / np.linalg.norm(axis)
     axis = axis * np.sign(axis[np.abs(axis).argmax()])
+    axis = axis.round(2) + 0.0  # no "-0.00"
     return f"{verb} ({', '.join(f'{value:.2f}' for value in axis)})"

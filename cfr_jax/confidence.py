@@ -16,7 +16,7 @@ from cfr_jax.quality import Quality
 from cfr_jax.refinement import Surface
 from cfr_jax.registration import Registration
 
-_FITTED = Path(__file__).parent / "models" / "confidence.json"
+FITTED = Path(__file__).parent / "models" / "confidence.json"
 
 
 @struct.dataclass
@@ -47,7 +47,8 @@ def gather(
     """The clues of an answer `transform` (source onto target)."""
 
     def mean(values, mask):
-        return jnp.sum(values * mask) / jnp.maximum(jnp.sum(mask), 1)
+        valid = mask.astype(values.dtype)
+        return jnp.sum(values * valid) / jnp.maximum(jnp.sum(valid), 1)
 
     def turned(a, b):
         return jnp.log(rigid.rotation_error(a, b) + 0.1)
@@ -83,4 +84,4 @@ def of_alignment(clues: Clues) -> float:
 
 @functools.cache
 def _fitted():
-    return json.loads(_FITTED.read_text())
+    return json.loads(FITTED.read_text())

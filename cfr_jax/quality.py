@@ -44,12 +44,13 @@ def measure(
     moved = rigid.apply(transform, source.points)
     found = closest(moved, target.points, target.mask)
     inlier = (found.square <= distance**2) & source.mask
-    count = jnp.sum(inlier)
+    counted = inlier.astype(moved.dtype)
+    count = jnp.sum(counted)
     rmse = jnp.sqrt(jnp.sum(jnp.where(inlier, found.square, 0)) / jnp.maximum(count, 1))
 
     normals = target.normals[found.index]
     rows = jnp.concatenate([jnp.cross(moved, normals), normals], axis=1)
-    information = jnp.matmul(rows.T, rows * inlier[:, None], precision=_HIGHEST)
+    information = jnp.matmul(rows.T, rows * counted[:, None], precision=_HIGHEST)
     _, directions = jnp.linalg.eigh(information)  # ascending
     weakest = directions[:, :_WEAKEST].T
     here = score(source, target, transform, distance)
@@ -63,7 +64,7 @@ def measure(
         return jnp.clip(rise / jnp.maximum(1 - here, 1e-6), 0, 1)
 
     return Quality(
-        fitness=count / jnp.maximum(jnp.sum(source.mask), 1),
+        fitness=count / jnp.maximum(jnp.sum(source.mask, dtype=count.dtype), 1),
         inlier_rmse=rmse,
         resistance=lax.map(resistance, weakest),
         weakest=weakest,

@@ -79,7 +79,8 @@ def score(
     """Mean over the source of the squared distance to the target, truncated at cut^2; in [0, 1]."""
     found = closest(rigid.apply(transform, source.points), target.points, target.mask)
     truncated = jnp.minimum(found.square / cut**2, 1)
-    return jnp.sum(truncated * source.mask) / jnp.maximum(jnp.sum(source.mask), 1)
+    valid = source.mask.astype(truncated.dtype)
+    return jnp.sum(truncated * valid) / jnp.maximum(jnp.sum(valid), 1)
 
 
 def _descend(source, target, transform, cut):
@@ -101,25 +102,28 @@ def _gauss_newton(source, target, transform, cut):
     """The twist that lessens sum_i w_i r_i' M_i r_i the most, r = T x - y, linearized."""
     moved = rigid.apply(transform, source.points)
     found = closest(moved, target.points, target.mask)
-    weight = jnp.maximum(1 - found.square / cut**2, 0) ** 2 * source.mask
+    weight = jnp.maximum(1 - found.square / cut**2, 0) ** 2
+    weight = jnp.where(source.mask, weight, 0)
     residual = moved - target.points[found.index]
     normals = rigid.rotate(transform, source.normals), target.normals[found.index]
     metric = weight[:, None, None] * _inverse_symmetric(sum(map(_plane, normals)))
     # a left twist (turn, slide) moves p by turn x p + slide
     turn = -jax.vmap(rigid.skew)(moved)
-    jacobian = jnp.concatenate([turn, jnp.broadcast_to(jnp.eye(3), turn.shape)], axis=2)
+    jacobian = jnp.concatenate(
+        [turn, jnp.broadcast_to(jnp.eye(3, dtype=turn.dtype), turn.shape)], axis=2
+    )
     weighted = jnp.einsum("nij,nik->njk", metric, jacobian, precision=_HIGHEST)
     system = jnp.einsum("nji,njk->ik", jacobian, weighted, precision=_HIGHEST)
     pull = jnp.einsum("nij,ni->j", weighted, residual, precision=_HIGHEST)
     # keeps directions that nothing determines (a plane sliding on a plane) at rest
     damping = 1e-6 * jnp.trace(system) + jnp.finfo(system.dtype).tiny
-    return -jnp.linalg.solve(system + damping * jnp.eye(6), pull)
+    return -jnp.linalg.solve(system + damping * jnp.eye(6, dtype=system.dtype), pull)
 
 
 def _plane(normals):
     """Covariance of a small plane: thin along the normal, one across; round where there is none."""
     outer = normals[:, :, None] * normals[:, None, :]
-    return jnp.eye(3) - (1 - _THICKNESS) * outer
+    return jnp.eye(3, dtype=normals.dtype) - (1 - _THICKNESS) * outer
 
 
 def _inverse_symmetric(m):
