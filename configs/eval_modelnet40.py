@@ -7,7 +7,7 @@ from ml_collections import ConfigDict
 
 
 def get_config() -> ConfigDict:
-    """As `eval_open_cad.py`, methods and settings included, on the benchmark's 1,266 test shapes."""
+    """As `eval_open_cad.py` with all its settings, on the benchmark's 1,266 test shapes."""
     config = _open_cad().get_config()
     config.title = "ModelNet40, partial pairs of unseen categories"
     config.data = ConfigDict()

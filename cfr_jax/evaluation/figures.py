@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _BINS = 5  # of pairs sorted by overlap or rotation, equally many in each
 _DPI = 150
+_NO_METHODS = ("identity", "truth")  # bounds, which only stretch the axes
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -51,7 +52,9 @@ def draw_all(
     """Writes the plots into `folder`."""
     unit = about["unit"] or "units"
     angle, distance = about["limits"]
-    shown = [m for m in measured if m.answered.any()]
+    shown = [m for m in measured if m.answered.any() and m.about["use"] not in _NO_METHODS]
+    if not shown:
+        return
     recall_over_error(folder / "recall.png", shown, angle, distance, unit)
     turned = metrics.err_r(
         np.tile(np.eye(4), (len(pairs), 1, 1)), np.stack([pair.transform for pair in pairs])
@@ -60,7 +63,7 @@ def draw_all(
     if all(pair.overlap is not None for pair in pairs):
         overlap = np.array([pair.overlap for pair in pairs], np.float64)
         by_quantity(folder / "by_overlap.png", shown, overlap, "overlap", about)
-    by_iteration(folder / "by_iteration.png", [m for m in shown if m.err_r.shape[1] > 1], unit)
+    by_iteration(folder / "by_iteration.png", shown, unit)
     time_against_accuracy(folder / "time.png", shown, about)
 
 
@@ -105,8 +108,9 @@ def by_quantity(
 
 
 def by_iteration(path: Path, measured: Sequence[Measured], unit: str) -> None:
-    """Mean and median error after each iteration; a refinement counts as one more."""
-    if not measured:
+    """Mean and median error after each iteration, of the methods that tell more than one; a
+    refinement counts as one more."""
+    if all(m.err_r.shape[1] == 1 for m in measured):
         return
     figure = new_figure(11, 4.2)
     for axes, which, label in zip(
@@ -117,6 +121,8 @@ def by_iteration(path: Path, measured: Sequence[Measured], unit: str) -> None:
     ):
         for style, m in _styled(measured):
             errors = getattr(m, which)[m.answered]
+            if errors.shape[1] == 1:
+                continue
             steps = np.arange(1, errors.shape[1] + 1)
             axes.plot(steps, errors.mean(axis=0), marker="o", **style)
             axes.plot(steps, np.median(errors, axis=0), ls=":", color=style["color"])
@@ -131,14 +137,11 @@ def time_against_accuracy(path: Path, measured: Sequence[Measured], about: dict[
     left, right = figure.subplots(1, 2)
     for style, m in _styled(measured):
         time = m.milliseconds()
-        if not time > 1e-3:  # the truth takes no time at all
-            continue
         for axes, value in (
             (left, np.nanmean(m.err_r[:, -1])),
             (right, m.recalled(*about["main_threshold"]).mean()),
         ):
             axes.plot([time], [value], marker="o", ms=9, **style | {"ls": ""})
-            axes.annotate(m.name, (time, value), (6, 4), textcoords="offset points", fontsize=8)
     for axes in (left, right):
         axes.set(xscale="log", xlabel="ms per pair")
     left.set(ylabel="mean rotation error (degrees)")
@@ -153,7 +156,7 @@ def _styled(measured: Sequence[Measured]) -> list[tuple[dict[str, Any], Measured
     colors = colormaps["tab20"].colors
     styled = []
     for number, m in enumerate(measured):
-        own = m.about.get("use") == "cfr"
+        own = m.about["use"] == "cfr"
         style = {"label": m.name, "color": colors[number % len(colors)]}
         styled.append((style | {"ls": "-" if own else "--", "lw": 2.2 if own else 1.3}, m))
     return styled
