@@ -46,6 +46,8 @@ _MOST_LINES = 3
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns its exit code, as `cfr --help` lists them."""
+    # XLA remarks on slow compilations there; standard error is for what the user can act on.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
         if sys.stdout is not None and hasattr(sys.stdout, "reconfigure"):
             # A file's name may hold bytes that no encoding can print.
