@@ -73,7 +73,7 @@ def batch_at(corpus: Corpus, position: int, size: int, sampling: Sampling, seed:
         epoch, place = divmod(number, len(corpus))
         order = np.random.default_rng((seed, epoch)).permutation(len(corpus))
         rng = np.random.default_rng((seed, epoch, place))
-        pairs.append(draw_pair(corpus, order[place], sampling, rng))
+        pairs.append(draw_pair(corpus, int(order[place]), sampling, rng))
     return {key: np.stack([pair[key] for pair in pairs]) for key in pairs[0]}
 
 
