@@ -189,7 +189,7 @@ def test_builds_are_compared_by_name(meshes, tmp_path):
     assert found.renamed == {"table/deep/2.off": ["chair", "table"]}
     # Lamps were the test there, tables are the test here, but for one that is a chair now.
     assert len(found.crossed) == 3 + 3
-    assert list(found.only_ours.values()) == [[1, 4]]  # what repeated the lamp that is gone
+    assert found.only_ours == {"lamp": 1}  # what repeated the lamp that is gone
     assert found.only_theirs == {
         "lamp": {"lamp/deep/4.off": "not in the sources, or of no category"}
     }

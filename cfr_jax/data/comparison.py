@@ -24,7 +24,7 @@ class Comparison:
     common: dict[str, int]  # "our split / their split" → shapes
     crossed: list[str]  # test here and trained on there, or the other way round
     renamed: dict[str, list[str]]  # name → category here, category there, where they differ
-    only_ours: dict[str, list[int]]  # category → shapes here, of those not there
+    only_ours: dict[str, int]  # category → shapes
     only_theirs: dict[str, dict[str, str]]  # category → name → why it was left out here
     distance: dict[str, float]  # mean distance to the nearest point, quantiles
     normals: dict[str, float]  # mean |cosine| between the normals of nearest points
@@ -38,7 +38,7 @@ class Comparison:
         lines += [f"in both     {kept}, of these {len(self.renamed)} in another category"]
         lines += [f"  {pair}: {shapes}" for pair, shapes in sorted(self.common.items())]
         lines += [f"crossed     {len(self.crossed)} between seen and unseen halves"]
-        only = sum(shapes for shapes, _ in self.only_ours.values())
+        only = sum(self.only_ours.values())
         lines += [f"only here   {only}", f"only there  {sum(map(len, self.only_theirs.values()))}"]
         for what, quantiles in (("distance", self.distance), ("normals", self.normals)):
             shown = ", ".join(f"{key} {value:.4f}" for key, value in quantiles.items())
@@ -70,14 +70,9 @@ def compare(ours: Path, theirs: Path) -> Comparison:
             if our_category != category:
                 renamed[name] = [our_category, category]
             both.append((name_share(name, "measure"), (our_split, our_row), (split, row)))
-    only_ours: dict[str, list[int]] = {}
-    for split, corpus in here.items():
-        for category, shapes in Counter(
-            corpus.categories[corpus.labels[row]] for where, row in rows.values() if where == split
-        ).items():
-            total = int((corpus.labels == corpus.categories.index(category)).sum())
-            before = only_ours.get(category, [0, 0])
-            only_ours[category] = [before[0] + shapes, before[1] + total]
+    only_ours = Counter(
+        here[split].categories[here[split].labels[row]] for split, row in rows.values()
+    )
     distances, cosines = [], []
     for _, (our_split, our_row), (split, row) in sorted(both)[:_MEASURED]:
         points, normals = here[our_split][our_row]
