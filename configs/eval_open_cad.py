@@ -31,18 +31,23 @@ def methods() -> dict:
     """
     local = {"distances": (0.2, 0.1, 0.05), "start": "centroid"}
     features = {"distance": 0.05, "normal_radius": 0.2}
-    # the same answers every time need one thread where threads race
+    # One thread where threads would race: for random numbers, or for the order of a sum.
     return {
         "identity": {"use": "identity"},
         "truth": {"use": "truth"},
-        "icp": {"use": "icp", "options": local},
-        "icp_plane": {"use": "icp_plane", "options": local | {"normal_radius": 0.2}},
+        "icp": {"use": "icp", "options": local, "threads": 1},
+        "icp_plane": {
+            "use": "icp_plane",
+            "options": local | {"normal_radius": 0.2},
+            "threads": 1,
+        },
         "gicp": {"use": "gicp", "options": local, "threads": 1},
         "gicp_jax": {"use": "gicp_jax", "options": {"cut": 0.1, "normal_radius": 0.2}},
         "fgr": {"use": "fgr", "options": features | {"feature_radius": 0.3}},
         "fgr_icp": {
             "use": "fgr_icp",
             "options": features | {"feature_radius": 0.3, "distances": (0.1, 0.05)},
+            "threads": 1,
         },
         "ransac": {"use": "ransac", "options": features | {"feature_radius": 0.3}, "threads": 1},
         "fgr_estimated": {
@@ -53,6 +58,7 @@ def methods() -> dict:
         "fgr_icp_estimated": {
             "use": "fgr_icp",
             "options": features | {"feature_radius": 0.45, "distances": (0.1, 0.05)},
+            "threads": 1,
             "estimated_normals": True,
         },
         "ransac_estimated": {
