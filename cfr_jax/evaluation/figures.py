@@ -16,7 +16,6 @@ from cfr_jax.evaluation.measuring import Measured
 from cfr_jax.viewer.atomic import write_atomically
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _BINS = 5  # of pairs sorted by overlap or rotation, equally many in each
@@ -153,11 +152,11 @@ def _styled(measured: Sequence[Measured]) -> list[tuple[dict[str, Any], Measured
     """Our own methods solid and bold, the others dashed; a color each."""
     from matplotlib import colormaps
 
-    colors = colormaps["tab20"].colors
+    colors = colormaps["tab20"]
     styled = []
     for number, m in enumerate(measured):
         own = m.about["use"] == "cfr"
-        style = {"label": m.name, "color": colors[number % len(colors)]}
+        style = {"label": m.name, "color": colors(number % colors.N)}
         styled.append((style | {"ls": "-" if own else "--", "lw": 2.2 if own else 1.3}, m))
     return styled
 
@@ -178,11 +177,9 @@ def _recall_label(about: dict[str, Any]) -> str:
 
 
 def _finish(figure: Figure, path: Path) -> None:
+    handles: dict[str, Any] = {}
     for axes in figure.axes:
         axes.grid(alpha=0.3)
-    handles: dict[str, Any] = {}
-    axes: Axes
-    for axes in figure.axes:
         handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     figure.legend(handles.values(), handles.keys(), loc="outside right center", fontsize=8)
     save_figure(figure, path)
