@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -53,11 +54,8 @@ def gather(
     def turned(a, b):
         return jnp.log(rigid.rotation_error(a, b) + 0.1)
 
-    before, last = (
-        registration.transforms[-2:]
-        if len(registration.transforms) > 1
-        else (registration.transforms[[-1, -1]])
-    )
+    # a single iteration has none before it, and counts as settled
+    before, last = registration.transforms[-2:][0], registration.transforms[-1]
     return Clues(
         fitness=quality.fitness,
         distance=quality.inlier_rmse * 20,
@@ -69,16 +67,15 @@ def gather(
     )
 
 
-def of_alignment(clues: Clues) -> float:
-    """Probability in [0, 1] that the answer is right to 5 degrees and 0.1 unit radii.
+def of_alignment(clues: Mapping[str, float]) -> float:
+    """Probability in [0, 1] that an answer with these `Clues`, by name, is right to 5 degrees and
+    0.1 unit radii.
 
     Logistic regression on the clues, fitted by `benchmarks/fit_confidence.py` to validation pairs
     with the weights that ship; nearer the truth the closer one's own data are to those.
     """
     fitted = _fitted()
-    logit = fitted["bias"] + sum(
-        weight * float(getattr(clues, name)) for name, weight in fitted["weights"].items()
-    )
+    logit = fitted["bias"] + sum(weight * clues[name] for name, weight in fitted["weights"].items())
     return float(1 / (1 + np.exp(-np.clip(logit, -30, 30))))
 
 

@@ -8,6 +8,8 @@ sign.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -18,11 +20,23 @@ from cfr_jax import rigid
 from cfr_jax.neighbors import closest
 
 _HIGHEST = lax.Precision.HIGHEST
-# In units of the unit sphere. Wide enough at first for what a network leaves, and at last no wider
-# than the surface's own noise and spacing.
-CUTS = (0.2, 0.1, 0.05)
+
+
+class Stage(NamedTuple):
+    """How far points may be from each other, and what shape they have."""
+
+    cut: float
+    """In units of the unit sphere."""
+    thickness: float
+    """Variance of a point's plane across it, as a share of that along it."""
+
+
+# Wide enough at first for what a network leaves, and at last no wider than the surface's own noise
+# and spacing. Thin planes slide past each other and find the way from afar; thick ones, between
+# planes and balls, use the points themselves, and end more precisely on noisy clouds.
+STAGES = (Stage(0.2, 0.01), Stage(0.1, 0.01), Stage(0.05, 0.1))
+CUT = STAGES[-1].cut
 _STEPS_PER_CUT = 12
-_THICKNESS = 1e-2  # variance across a plane, as a share of the variance along it
 _SETTLED = 1e-5  # radians and units: smaller updates end a stage
 
 
@@ -51,22 +65,22 @@ def refine(
     source: Surface,
     target: Surface,
     initial: Float[Array, "4 4"],
-    cuts: tuple[float, ...] = CUTS,
+    stages: tuple[Stage, ...] = STAGES,
 ) -> Refinement:
     """Refines `initial`, which maps source onto target, within the unit sphere.
 
-    For each cut in turn: pair every source point with its closest target point, weigh the pairs
+    In each stage: pair every source point with its closest target point, weigh the pairs
     down to zero at the cut (Tukey's biweight), take a Gauss-Newton step on SE(3), until nothing
     moves. The result is kept only if it scores no worse than `initial` (`score` at the last cut).
     """
 
-    def stage(transform, cut):
-        transform, steps, settled = _descend(source, target, transform, cut)
+    def run(transform, stage):
+        transform, steps, settled = _descend(source, target, transform, stage)
         return transform, (steps, settled)
 
     # a scan, so that the stages share one compiled loop
-    transform, (steps, settled) = lax.scan(stage, initial, jnp.array(cuts, initial.dtype))
-    before, after = (score(source, target, t, cuts[-1]) for t in (initial, transform))
+    transform, (steps, settled) = lax.scan(run, initial, Stage(*jnp.array(stages, initial.dtype).T))
+    before, after = (score(source, target, t, stages[-1].cut) for t in (initial, transform))
     improved = after <= before
     return Refinement(
         jnp.where(improved, transform, initial), improved, settled[-1], jnp.sum(steps)
@@ -83,14 +97,14 @@ def score(
     return jnp.sum(truncated * valid) / jnp.maximum(jnp.sum(valid), 1)
 
 
-def _descend(source, target, transform, cut):
+def _descend(source, target, transform, stage):
     def unsettled(state):
         _, step, size = state
         return (step < _STEPS_PER_CUT) & (size > _SETTLED)
 
     def step(state):
         transform, count, _ = state
-        twist = _gauss_newton(source, target, transform, cut)
+        twist = _gauss_newton(source, target, transform, stage)
         return rigid.compose(rigid.exp(twist), transform), count + 1, jnp.max(jnp.abs(twist))
 
     start = (transform, jnp.zeros((), jnp.int32), jnp.array(jnp.inf, transform.dtype))
@@ -98,15 +112,17 @@ def _descend(source, target, transform, cut):
     return transform, steps, size <= _SETTLED
 
 
-def _gauss_newton(source, target, transform, cut):
+def _gauss_newton(source, target, transform, stage):
     """The twist that lessens sum_i w_i r_i' M_i r_i the most, r = T x - y, linearized."""
     moved = rigid.apply(transform, source.points)
     found = closest(moved, target.points, target.mask)
-    weight = jnp.maximum(1 - found.square / cut**2, 0) ** 2
+    weight = jnp.maximum(1 - found.square / stage.cut**2, 0) ** 2
     weight = jnp.where(source.mask, weight, 0)
     residual = moved - target.points[found.index]
     normals = rigid.rotate(transform, source.normals), target.normals[found.index]
-    metric = weight[:, None, None] * _inverse_symmetric(sum(map(_plane, normals)))
+    metric = weight[:, None, None] * _inverse_symmetric(
+        sum(_plane(n, stage.thickness) for n in normals)
+    )
     # a left twist (turn, slide) moves p by turn x p + slide
     turn = -jax.vmap(rigid.skew)(moved)
     jacobian = jnp.concatenate(
@@ -115,15 +131,15 @@ def _gauss_newton(source, target, transform, cut):
     weighted = jnp.einsum("nij,nik->njk", metric, jacobian, precision=_HIGHEST)
     system = jnp.einsum("nji,njk->ik", jacobian, weighted, precision=_HIGHEST)
     pull = jnp.einsum("nij,ni->j", weighted, residual, precision=_HIGHEST)
-    # keeps directions that nothing determines (a plane sliding on a plane) at rest
+    # keeps directions that nothing determines (a line turning about itself) at rest
     damping = 1e-6 * jnp.trace(system) + jnp.finfo(system.dtype).tiny
     return -jnp.linalg.solve(system + damping * jnp.eye(6, dtype=system.dtype), pull)
 
 
-def _plane(normals):
+def _plane(normals, thickness):
     """Covariance of a small plane: thin along the normal, one across; round where there is none."""
     outer = normals[:, :, None] * normals[:, None, :]
-    return jnp.eye(3, dtype=normals.dtype) - (1 - _THICKNESS) * outer
+    return jnp.eye(3, dtype=normals.dtype) - (1 - thickness) * outer
 
 
 def _inverse_symmetric(m):

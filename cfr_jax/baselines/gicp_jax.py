@@ -27,7 +27,7 @@ def register(
     are estimated where they are missing.
     """
     motion = initial(source, target, start)
-    center, scale = target.points.mean(axis=0), cut / refinement.CUTS[-1]
+    center, scale = target.points.mean(axis=0), cut / refinement.CUT
     moved = source.points @ motion[:3, :3].T + motion[:3, 3]
     found = _refine(
         *(jnp.asarray((points - center) / scale, jnp.float32) for points in (moved, target.points)),
