@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracle import cfr, pieces
+from scipy.spatial import cKDTree
 
-from cfr_jax.neighbors import nearest, nearest_on_host
+from cfr_jax.neighbors import closest, nearest, nearest_on_host
 
 on_device = jax.jit(nearest, static_argnames=("k", "radius"))
 
@@ -105,3 +106,18 @@ def test_an_impossible_k_is_refused(k):
         nearest(jnp.asarray(points), k)
     with pytest.raises(ValueError, match=rf"^k: got {k} neighbors for a cloud of 5 points"):
         nearest_on_host(points, k)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_closest_point_is_that_of_a_search_through_all(masked):
+    rng = np.random.default_rng(6)
+    queries, points = (rng.normal(size=(n, 3)).astype(np.float32) for n in (1100, 1000))
+    mask = rng.random(1000) < 0.5 if masked else np.ones(1000, bool)
+
+    found = jax.jit(closest)(
+        jnp.asarray(queries), jnp.asarray(points), jnp.asarray(mask) if masked else None
+    )
+
+    distance, index = cKDTree(points[mask]).query(queries)
+    np.testing.assert_array_equal(found.index, np.flatnonzero(mask)[index])
+    np.testing.assert_allclose(found.square, distance**2, rtol=1e-5)

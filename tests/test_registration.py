@@ -240,7 +240,7 @@ def test_a_cloud_smaller_than_k_has_fewer_neighbors(params):
     cloud = prepare(source)
 
     assert cloud.neighbors.shape == (20, 19)
-    assert np.isfinite(register(params, source, target, iterations=2).transforms).all()
+    assert np.isfinite(register(params, cloud, target, iterations=1).transforms).all()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The training step: it learns, it skips what is not finite, and a run resumes bit for bit."""
 
+import functools
 import json
 
 import h5py
@@ -10,14 +11,14 @@ import pytest
 from ml_collections import ConfigDict
 
 from cfr_jax import trainer, training, weights
+from cfr_jax.checkpoints import Checkpoints
 from cfr_jax.data.batches import Sampling, batch_at
 from cfr_jax.data.corpus import read_corpus
 from cfr_jax.registration import Settings
 
 POINTS, NEIGHBORS, BATCH = 24, 6, 2
-OPTIMIZER = training.make_optimizer(
-    peak_rate=3e-3, steps=30, warmup=0.1, clip=1.0, weight_decay=1e-5
-)
+make_optimizer = functools.cache(training.make_optimizer)  # the same one compiles once
+OPTIMIZER = make_optimizer(peak_rate=5e-3, steps=16, warmup=0.1, clip=1.0, weight_decay=1e-5)
 
 
 @pytest.fixture(autouse=True)
@@ -71,12 +72,12 @@ def assert_same(tree, other):
 def test_the_loss_of_a_batch_falls(batch):
     state, losses = fresh(), []
 
-    for _ in range(30):
+    for _ in range(16):
         state, measured = step(state, batch)
         losses.append(float(measured.total))
 
     assert losses[-1] < 0.7 * losses[0]
-    assert int(state.step) == 30 and int(state.skipped) == 0
+    assert int(state.step) == 16 and int(state.skipped) == 0
 
 
 def test_a_batch_that_is_not_finite_changes_nothing_but_the_count(batch):
@@ -116,20 +117,21 @@ def test_the_average_follows_the_parameters(batch):
     np.testing.assert_allclose(kernel[2], wanted, atol=1e-6)
 
 
-def config(corpus_file, steps):
+def config(corpus_file):
+    """A run of 16 steps, compiled to the same program as the steps above."""
     given = ConfigDict()
     given.seed, given.iterations = 0, 1
     given.data = {"train": str(corpus_file), "validation": str(corpus_file)}
     given.phases = (
         {"steps": 2, "points": POINTS, "neighbors": NEIGHBORS, "batch": BATCH},
-        {"steps": steps - 2, "points": POINTS, "neighbors": NEIGHBORS, "batch": BATCH},
+        {"steps": 14, "points": POINTS, "neighbors": NEIGHBORS, "batch": BATCH},
     )
     given.sampling = {"keep": (0.7, 0.7), "estimated_normals": 0.5}
     given.train = {
-        "peak_rate": 1e-3, "warmup": 0.1, "clip": 1.0, "weight_decay": 1e-5, "start_from": "",
+        "peak_rate": 5e-3, "warmup": 0.1, "clip": 1.0, "weight_decay": 1e-5, "start_from": "",
         "correspondence_weight": 0.05, "average_decay": 0.9, "pairs_at_once": 1, "workers": 2,
     }  # fmt: skip
-    given.log_every, given.validate_every, given.validation_pairs = 2, 2, 2
+    given.log_every, given.validate_every, given.validation_pairs = 4, 4, 2
     given.keep_checkpoints = 2
     return given
 
@@ -138,65 +140,73 @@ class Killed(Exception):
     """Stands for the power going off."""
 
 
-@pytest.fixture
-def quick_validation(monkeypatch):
-    """The compiled validation at full size takes longer than all the rest here."""
+def run(corpus_file, folder):
+    """A whole training, but for the validation: compiling that takes longer than all the rest."""
 
     def validate(params, batch):
-        kernel = np.asarray(params["features"]["kernel_1"])
-        return {"rotation_mean": float(np.sum(kernel**2)), "rotation_median": 0.0,
-                "recall_5deg_0.1": 0.0}  # fmt: skip
+        change = np.sum(np.asarray(params["features"]["kernel_1"]) ** 2)
+        return {"rotation_mean": float(change), "rotation_median": 0.0, "recall_5deg_0.1": 0.0}
 
-    monkeypatch.setattr(trainer, "validate", validate)
+    with pytest.MonkeyPatch.context() as patch, jax.numpy_dtype_promotion("standard"):
+        patch.setattr(trainer, "validate", validate)
+        patch.setattr(training, "make_optimizer", make_optimizer)
+        return trainer.run(config(corpus_file), folder)
 
 
-def test_an_interrupted_run_resumes_bit_for_bit(
-    corpus_file, tmp_path, monkeypatch, quick_validation
-):
-    whole = trainer.run(config(corpus_file, 6), tmp_path / "whole")
-
-    steps, train_step = [], training.train_step
-
-    def killed_in_its_fourth(*arguments, **named):
-        steps.append(None)
-        if len(steps) == 4:
-            raise Killed
-        return train_step(*arguments, **named)
-
-    monkeypatch.setattr(training, "train_step", killed_in_its_fourth)
-    with pytest.raises(Killed):
-        trainer.run(config(corpus_file, 6), tmp_path / "parts")
-    resumed = trainer.run(config(corpus_file, 6), tmp_path / "parts")
-
-    assert len(steps) == 4 + 4  # killed in step 4, gone on after the checkpoint of step 2
-    assert resumed == whole
-    restored = [state_of(tmp_path / name) for name in ("whole", "parts")]
-    assert int(restored[0].step) == 6
-    assert_same(*restored)
-    assert_same(*(weights.load_params(tmp_path / n / "weights.safetensors")
-                  for n in ("whole", "parts")))  # fmt: skip
+@pytest.fixture(scope="module")
+def whole(corpus_file, tmp_path_factory):
+    """A run that nothing disturbed: its folder and its best validation."""
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, run(corpus_file, folder)
 
 
 def state_of(workdir):
-    from cfr_jax.checkpoints import Checkpoints
-
-    optimizer = training.make_optimizer(
-        peak_rate=1e-3, steps=6, warmup=0.1, clip=1.0, weight_decay=1e-5
-    )
-    like = training.init_state(training.fresh_params(0, 1), optimizer)
+    like = training.init_state(training.fresh_params(0, 1), OPTIMIZER)
     with Checkpoints(workdir / "checkpoints", keep=2) as checkpoints:
         return checkpoints.restore(like)[0]
 
 
-def test_a_run_leaves_its_measurements_and_its_weights(corpus_file, tmp_path, quick_validation):
-    best = trainer.run(config(corpus_file, 4), tmp_path)
+def test_an_interrupted_run_resumes_bit_for_bit(corpus_file, tmp_path, monkeypatch, whole):
+    steps, train_step = [], training.train_step
 
-    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [2, 2, 4, 4]
+    def killed_in_step_11(*arguments, **named):
+        steps.append(None)
+        if len(steps) == 11:
+            raise Killed
+        return train_step(*arguments, **named)
+
+    monkeypatch.setattr(training, "train_step", killed_in_step_11)
+    with pytest.raises(Killed):
+        run(corpus_file, tmp_path)
+    best = run(corpus_file, tmp_path)
+
+    assert len(steps) == 11 + 8  # it went on after the checkpoint of step 8
+    assert best == whole[1]
+    first, second = (state_of(folder) for folder in (whole[0], tmp_path))
+    assert int(first.step) == 16
+    assert_same(first, second)
+    files = (folder / "weights.safetensors" for folder in (whole[0], tmp_path))
+    assert_same(*(weights.load_params(file) for file in files))
+
+
+def test_a_finished_run_has_nothing_left_to_do(corpus_file, whole, monkeypatch):
+    monkeypatch.delattr(training, "train_step")
+
+    assert run(corpus_file, whole[0]) == whole[1]
+
+
+def test_a_run_leaves_its_measurements_and_its_weights(whole):
+    folder, best = whole
+
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines if "loss" in line] == [4, 8, 12, 16]
     assert all(np.isfinite(line["loss"]) for line in lines if "loss" in line)
-    made = weights.read_weights(tmp_path / "weights.safetensors")
-    assert json.loads(made.notes["validation"]) == json.loads(json.dumps(best))
-    assert json.loads(made.notes["config"])["validate_every"] == 2
+    measured = {line["step"]: line["validation"] for line in lines if "validation" in line}
+    assert list(measured) == [4, 8, 12, 16]
+    assert best["rotation_mean"] == min(found["rotation_mean"] for found in measured.values())
+    made = weights.read_weights(folder / "weights.safetensors")
+    assert json.loads(made.notes["validation"]) == best
+    assert json.loads(made.notes["config"])["validate_every"] == 4
 
 
 def test_validation_measures_the_last_transform(corpus_file, monkeypatch):
