@@ -104,7 +104,7 @@ def align(
         initial = _rigid(initial)
     budget = DEFAULT_BUDGET if max_points is None else _whole("max_points", max_points, least=3)
     seed = _whole("seed", seed, least=0)
-    params = load_params() if params is None else params
+    params = _default_params() if params is None else params
     if not isinstance(params, Mapping):
         raise ValueError(
             f"params: got a {type(params).__name__}, wanted the parameters of load_params"
@@ -211,6 +211,11 @@ def _program(refine, structure, shapes):
     """The compiled program for clouds of these sizes, so that compiling can be timed apart."""
     arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
     return _solve.lower(*arguments, refine=refine).compile()
+
+
+@functools.cache
+def _default_params():
+    return load_params()
 
 
 def _whole(name, value, *, least):

@@ -41,6 +41,7 @@ def get_config() -> ConfigDict:
 
     config.log_every = 50  # steps
     config.validate_every = 500
-    config.validation_pairs = 465  # all of val.h5: on 96, two flipped shapes decided which weights were best
+    # all of val.h5: on 96, two flipped shapes decided which weights were best
+    config.validation_pairs = 465
     config.keep_checkpoints = 2
     return config
