@@ -378,5 +378,10 @@ def test_clouds_of_any_size_go_through_align(monkeypatch):
     assert answer.transforms.shape == (6, 4, 4)
     assert answer.seconds == 1.0
     assert asked == {"params": {}, "refine": True, "max_points": 9, "seed": 3, "normals": None}
+
+
+def test_a_network_goes_through_register_or_align_and_nothing_else(unchecked):
+    from cfr_jax.evaluation import network
+
     with pytest.raises(ValueError, match="through is 'luck'"):
         network.make_network(weights="w", refine=True, through="luck")

@@ -88,6 +88,13 @@ class Page:
             assert time.monotonic() < deadline, f"still at station {self.root('station')}"
             time.sleep(0.05)
 
+    def wait_until_still(self):
+        """The station reads 1.000 a frame or two before the motion has ended."""
+        deadline = time.monotonic() + 20
+        while self["play"].get_attribute("data-playing") is not None:
+            assert time.monotonic() < deadline, "still playing"
+            time.sleep(0.05)
+
     def settled(self):
         self.driver.execute_async_script(
             "const done = arguments[0];"
@@ -339,6 +346,7 @@ def test_the_page_plays_once_by_itself_and_again_when_asked(open_page, chromium)
     page = open_page(make_scene(transforms=scene.transforms[[0, -1]], labels=("start", "refined")))
     try:
         page.wait_for_station(1.0)
+        page.wait_until_still()
         seen = page.driver.execute_async_script(
             "const [done, seen, root] = [arguments[0], [], document.documentElement];"
             "new MutationObserver(() => {"
