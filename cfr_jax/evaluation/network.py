@@ -43,13 +43,13 @@ def make_network(
     the call's. "align" brings clouds of any size and place to the network's, pair by pair, with
     `max_points` and `seed` as `align` has them.
     """
+    if through not in ("register", "align"):
+        raise ValueError(f"through is {through!r}, wanted 'register' or 'align'")
     params = load_params(weights)
     if through == "align":
         return functools.partial(
             _align_each, params, refine, estimated, max_points=max_points, seed=seed
         )
-    if through != "register":
-        raise ValueError(f"through is {through!r}, wanted 'register' or 'align'")
     return functools.partial(_register_batches, params, refine, estimated, batch, vectorized)
 
 
