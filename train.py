@@ -17,7 +17,10 @@ def main(_) -> None:
     """Everything of interest is in `cfr_jax.trainer`."""
     from cfr_jax import trainer
 
-    best = trainer.run(_CONFIG.value, Path(_WORKDIR.value))
+    try:
+        best = trainer.run(_CONFIG.value, Path(_WORKDIR.value))
+    except ValueError as error:
+        raise SystemExit(f"train.py: error: {error}") from error
     print(f"best validation at step {best['step']}: {best}")
 
 

@@ -27,6 +27,8 @@ _DISTANCE = refinement.CUT
 # free directions; of partial views of real objects about three quarters measured more.
 _FREE = 0.08
 _TRUSTED = 0.5
+_HARDLY = 0.2  # of the source on the target: too little to say what the shapes determine
+_SIZES_APART = 5.0  # more than partial views of one thing differ in radius
 
 
 @dataclass(frozen=True)
@@ -155,7 +157,9 @@ def align(
         source_rows=unit_source.rows,
         target_rows=unit_target.rows,
         neighbors=neighbors,
-        warnings=_warnings(None if determined else weakest, probability, fitness, neighbors),
+        warnings=_warnings(
+            None if determined else weakest, probability, fitness, neighbors, frames.size_ratio
+        ),
         seconds={
             "compile": compiled - started,
             "run": done - compiled,
@@ -244,9 +248,16 @@ def _rigid(initial):
     return matrix
 
 
-def _warnings(free, probability, fitness, neighbors):
+def _warnings(free, probability, fitness, neighbors, size_ratio):
     warnings = []
-    if free is not None:
+    if not 1 / _SIZES_APART < size_ratio < _SIZES_APART:
+        larger, smaller, times = "source", "target", size_ratio
+        if size_ratio < 1:
+            larger, smaller, times = "target", "source", 1 / size_ratio
+        warnings.append(f"the {larger} is {times:.3g} times as large as the {smaller}: same units?")
+    if fitness < _HARDLY:
+        warnings.append(f"the clouds hardly meet: {fitness:.0%} of the source lies on the target")
+    elif free is not None:
         warnings.append(f"the clouds do not determine the motion: they {_describe(free)} freely")
     if probability < _TRUSTED:
         warnings.append(

@@ -35,6 +35,8 @@ class Frames:
     scale: float
     initial: Float[np.ndarray, "4 4"]
     """Moves the caller's source before it is centered."""
+    size_ratio: float = 1.0
+    """Radius of the source over that of the target."""
 
     def to_caller(self, transforms: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
         """Motions between the unit clouds as motions of the caller's source onto the target."""
@@ -73,9 +75,9 @@ def unit_frames(
     (source_center, source_radius), (target_center, target_radius) = (
         _ball(name, cloud.points) for name, cloud in (("source", source), ("target", target))
     )
-    scale = max(source_radius, target_radius)
+    scale, ratio = max(source_radius, target_radius), source_radius / target_radius
     if initial is None:
-        return Frames(source_center, target_center, scale, np.eye(4))
+        return Frames(source_center, target_center, scale, np.eye(4), ratio)
     place = initial[:3, :3] @ source_center + initial[:3, 3]
     away = float(np.abs(place - target_center).max())
     if not away <= _FARTHEST * scale:
@@ -88,7 +90,7 @@ def unit_frames(
     exact = np.eye(4)
     exact[:3, :3] = _orthonormal(initial[:3, :3])
     exact[:3, 3] = place - exact[:3, :3] @ source_center
-    return Frames(target_center, target_center, scale, exact)
+    return Frames(target_center, target_center, scale, exact, ratio)
 
 
 def to_unit(

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
@@ -76,9 +77,9 @@ class Registration:
     """Annealing: how far in feature space it reached."""
 
     @property
-    def transform(self) -> Float[Array, "4 4"]:
-        """The last motion; maps source onto target."""
-        return self.transforms[-1]
+    def transform(self) -> Float[Array, "*batch 4 4"]:
+        """The last motion; maps source onto target. Batched as `transforms` is, after `vmap`."""
+        return self.transforms[..., -1, :, :]
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
@@ -116,11 +117,17 @@ def prepare(
     return Cloud(points, normals, neighbors, mask)
 
 
-@functools.partial(jax.jit, static_argnames=("settings",))
 def encode(
     params: dict, target: Float[Array, "m c"] | Cloud, *, settings: Settings = Settings()
 ) -> Encoded:
-    """The features of a reference in every iteration; hand it to `register` as the target."""
+    """The features of a reference in every iteration; hand it to `register` as the target, with the
+    same settings. Raises ValueError as `register` does."""
+    _check_values("target", target)
+    return _encode(params, target, settings=settings)
+
+
+@functools.partial(jax.jit, static_argnames=("settings",))
+def _encode(params, target, *, settings):
     cloud = _prepared("target", target, settings)
     network = bind(params)
     features = network.cascade.at_rest(
@@ -129,7 +136,6 @@ def encode(
     return Encoded(cloud, features)
 
 
-@functools.partial(jax.jit, static_argnames=("iterations", "settings"))
 def register(
     params: dict,
     source: Float[Array, "n c"] | Cloud,
@@ -145,14 +151,22 @@ def register(
     `iterations` may be anything from 1; beyond the L of the parameters, the last layer is repeated
     on the features it was trained to receive, with its own annealing and L passes: the cloud moves
     on, the features only follow its position. Differentiates through everything but the choice of
-    neighbors. Raises ValueError on wrong shapes.
+    neighbors. Raises ValueError on wrong shapes, and for values that are no finite numbers, where
+    they can be seen: inside `jit` and `vmap` they cannot, and NaN in gives NaN out.
     """
+    _check_values("source", source)
+    _check_values("target", target)
+    return _register(params, source, target, iterations=iterations, settings=settings)
+
+
+@functools.partial(jax.jit, static_argnames=("iterations", "settings"))
+def _register(params, source, target, *, iterations, settings):
     iterations = iterations_of(params) if iterations is None else iterations
     if iterations < 1:
         raise ValueError(f"iterations: got {iterations}, wanted at least 1")
     source = _prepared("source", source, settings)
     if not isinstance(target, Encoded):
-        target = encode(params, target, settings=settings)
+        target = _encode(params, target, settings=settings)
     steps = list(iterate(params, source, target, iterations, settings))
     return Registration(
         transforms=jnp.stack([step.transform for step in steps]),
@@ -229,6 +243,25 @@ def _prepared(name, cloud, settings):
         return cloud
     _check_points(name, cloud)
     return prepare(cloud, settings=settings)
+
+
+def _check_values(name, cloud):
+    """What a compiled function cannot tell: kinds and values, where they are known by now."""
+    if isinstance(cloud, Cloud | Encoded | jax.core.Tracer):
+        return
+    if not isinstance(cloud, np.ndarray | jax.Array):
+        raise ValueError(
+            f"{name}: got a {type(cloud).__name__}, wanted an array (n, 3) or (n, 6), "
+            "or what `prepare` or `encode` returned"
+        )
+    _check_points(name, cloud)
+    if cloud.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: got {cloud.dtype}, wanted floats or integers")
+    wrong = np.flatnonzero(~np.isfinite(np.asarray(cloud, np.float64)).all(axis=1))
+    if len(wrong):
+        raise ValueError(
+            f"{name}: row {wrong[0]} is not finite, and {len(wrong) - 1} more; wanted numbers"
+        )
 
 
 def _check_points(name, points):

@@ -15,7 +15,8 @@ N, M, L = 37, 41, 3
 def program():
     params = jax.eval_shape(lambda: init_params(jax.random.key(0), L))
     source, target = (jax.ShapeDtypeStruct((n, 6), jnp.float32) for n in (N, M))
-    return register.trace(params, source, target, settings=Settings(neighbors=8))
+    traced = jax.jit(register, static_argnames=("settings",))
+    return traced.trace(params, source, target, settings=Settings(neighbors=8))
 
 
 def equations(jaxpr):

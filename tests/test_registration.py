@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from oracle import authors, cfr, clouds, pieces
 
+from cfr_jax import registration
 from cfr_jax.convert import from_state_dict
 from cfr_jax.features import raw_features
 from cfr_jax.neighbors import nearest_on_host
@@ -175,7 +176,9 @@ def test_compiled_or_not_is_the_same(params):
     source, target = prepare(source, settings=settings), encode(params, target, settings=settings)
     compiled = register(params, source, target, iterations=1, settings=settings)
 
-    plain = register.__wrapped__(params, source, target, iterations=1, settings=settings)
+    plain = registration._register.__wrapped__(
+        params, source, target, iterations=1, settings=settings
+    )
 
     close(plain.transforms, compiled.transforms)
     close(plain.weights, compiled.weights)
@@ -276,3 +279,27 @@ def test_prepare_refuses_what_does_not_fit_together(unchecked, name, change):
 
     with pytest.raises(ValueError, match=f"^{name}: got"):
         prepare(**arguments)
+
+
+def test_values_that_are_no_numbers_are_refused_by_name(params, pair, unchecked):
+    source, target = both(pair)
+    broken = np.asarray(source).copy()
+    broken[3, 1] = np.nan
+    with pytest.raises(ValueError, match="source: row 3 is not finite"):
+        register(params, broken, target)
+    with pytest.raises(ValueError, match="target: got a list"):
+        register(params, source, [[0.0, 0.0, 0.0]] * 9)
+    with pytest.raises(ValueError, match="target: got a NoneType"):
+        encode(params, None)
+    with pytest.raises(ValueError, match="source: got bool"):
+        register(params, np.ones((9, 3), bool), target)
+
+
+def test_the_last_transform_of_a_batch_is_the_last_of_each_pair(params, pair):
+    source, target = both(pair)
+    one = register(params, source, target)
+
+    batch = jax.vmap(register, (None, 0, None))(params, jnp.stack([source, source]), target)
+
+    assert batch.transform.shape == (2, 4, 4)
+    close(batch.transform[0], one.transform)
