@@ -205,3 +205,10 @@ def test_laz_without_its_decoder_tells_how_to_get_it(tmp_path, monkeypatch):
 def test_a_negative_number_of_samples_is_refused(tmp_path):
     with pytest.raises(ValueError, match="samples must be 0 or more, got -1"):
         read(tmp_path / "mesh.off", samples=-1)
+
+
+def test_an_array_on_its_side_is_no_cloud_of_three_points(tmp_path):
+    path = tmp_path / "side.npy"
+    np.save(path, np.random.default_rng(0).normal(size=(3, 400)))
+
+    assert "transposed" in refusal(path)

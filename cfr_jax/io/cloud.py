@@ -103,6 +103,10 @@ def usable_normals(normals: Real[np.ndarray, "n 3"]) -> Real[np.ndarray, "n 3"] 
     return normals if whole.all() else None
 
 
+# More numbers than this to a point are not seen; three long rows are a cloud on its side.
+_MOST_COLUMNS = 64
+
+
 def cloud_from_table(table: np.ndarray, name: str) -> PointCloud:
     """A cloud from rows of x, y, z and perhaps more.
 
@@ -111,6 +115,10 @@ def cloud_from_table(table: np.ndarray, name: str) -> PointCloud:
     """
     if table.ndim != 2 or table.shape[1] < 3:
         raise ValueError(f"wanted rows of x, y, z and perhaps more, got the shape {table.shape}")
+    if len(table) <= 6 and table.shape[1] > _MOST_COLUMNS:
+        raise ValueError(
+            f"got the shape {table.shape}, wanted a row for each point: is it transposed (.T)?"
+        )
     normals = None
     if table.shape[1] == 6 and len(table):
         candidate = as_float64(table[:, 3:])
