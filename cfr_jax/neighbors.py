@@ -92,8 +92,8 @@ def _k_smallest(values: Float[Array, "r n"], k: int) -> Int32[Array, "r k"]:
     """Columns of each row's k smallest non-negative values, in the order of the columns.
 
     Bisection on the bits finds the k-th smallest value, and counting bits in packed words finds the
-    columns below it: plain vector arithmetic throughout, an order of magnitude faster than XLA's
-    `top_k` on CPU, which sorts.
+    columns below it: plain vector arithmetic throughout. Of 717 points with k = 64 on two cores it
+    took 6.4 ms, XLA's `top_k` 9.6 ms (2,048 points: 31 and 44 ms), and ties have an order.
     """
     n = values.shape[1]
     bits = lax.bitcast_convert_type(values, jnp.int32)  # monotonic, as no value is negative
