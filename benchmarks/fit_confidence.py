@@ -23,6 +23,7 @@ from cfr_jax import confidence, metrics
 from cfr_jax.alignment import align
 from cfr_jax.data.corpus import Corpus, read_corpus
 from cfr_jax.data.protocol import Protocol, partial, random_pair
+from cfr_jax.viewer.atomic import write_atomically
 
 CLUES = tuple(field.name for field in dataclasses.fields(confidence.Clues))
 _PENALTY = 1e-3  # on the squared weights: clues overlap
@@ -44,7 +45,8 @@ def gather(corpus: Corpus, count: int, seed: int) -> tuple[np.ndarray, np.ndarra
             target = random_pair(*corpus[other], partial, rng).target
         found = align(pair.source, target)
         truth, estimate = pair.transform[None].astype(float), found.transform[None]
-        close = metrics.err_r(estimate, truth)[0] < 5 and metrics.err_t(estimate, truth)[0] < 0.1
+        errors = metrics.err_r(estimate, truth), metrics.err_t(estimate, truth)
+        close = metrics.recalled(*errors, 5.0, 0.1)[0]
         clues.append([found.clues[name] for name in CLUES])
         right.append(bool(close) and kind != 7)
         shapes.append(shape)
@@ -109,9 +111,7 @@ def main() -> None:
     fitted = fit(clues, right)
     weights = {name: round(float(w), 4) for name, w in zip(CLUES, fitted[:-1], strict=True)}
     content = {"bias": round(float(fitted[-1]), 4), "weights": weights, "fit": report}
-    beside = args.out.with_suffix(".tmp")
-    beside.write_text(json.dumps(content, indent=2) + "\n")
-    beside.replace(args.out)
+    write_atomically(args.out, (json.dumps(content, indent=2) + "\n").encode())
     print(json.dumps(content, indent=2))
 
 

@@ -40,28 +40,19 @@ def nearest(
             f"k: got {k} neighbors for a cloud of {n} points, wanted 1 <= k <= {n - 1}"
         )
     points = points.astype(jnp.float32)  # as the host measures; the search works on its bits
-    rows = max(1, min(n, _BLOCK // n))
-    blocks = -(-n // rows)
-    queries = jnp.pad(points, ((0, blocks * rows - n), (0, 0)))
     limit = jnp.inf if radius is None else radius * radius
 
-    def block(start):
-        row = start + jnp.arange(rows)
-        here = lax.dynamic_slice_in_dim(queries, start, rows)
-        # by differences: |a|^2 - 2ab + |b|^2 cancels to nothing for close points far from the
-        # origin
-        square = sum((here[:, axis, None] - points[None, :, axis]) ** 2 for axis in range(3))
+    def choose(row, square):
         if mask is not None:
             square = jnp.where(mask, square, jnp.inf)
-        square = jnp.where(row[:, None] == jnp.arange(n), jnp.inf, square)
+        square = jnp.where(row == jnp.arange(n), jnp.inf, square)
         first = jnp.argmin(square, axis=1).astype(jnp.int32)
         chosen = _k_smallest(square, k)
         far = ~(jnp.take_along_axis(square, chosen, axis=1) <= limit)
         far |= jnp.isinf(jnp.take_along_axis(square, chosen, axis=1))
         return jnp.where(far, first[:, None], chosen)
 
-    found = lax.map(block, rows * jnp.arange(blocks))
-    return found.reshape(blocks * rows, k)[:n]
+    return _by_rows(points, choose)
 
 
 def first_in_ball(points: Float[Array, "n 3"], k: int, radius: float) -> Int32[Array, "n k"]:
@@ -70,22 +61,33 @@ def first_in_ball(points: Float[Array, "n 3"], k: int, radius: float) -> Int32[A
     RPM-Net's neighborhoods: not the nearest, and with repeated centers where a ball is sparse. A
     rigid motion does not change them.
     """
+
+    def choose(row, square):
+        inside = (square <= radius * radius) & (row != jnp.arange(points.shape[0]))
+        rank = jnp.arange(k, dtype=jnp.int32)[None, :]
+        found = _nth_set_bit(_pack(inside), jnp.broadcast_to(rank, (len(row), k)))
+        return jnp.where(rank < jnp.sum(inside, axis=1, keepdims=True), found, row)
+
+    return _by_rows(points, choose)
+
+
+def _by_rows(points, choose):
+    """`choose(row, square)` for blocks of rows: their numbers (r, 1) and their squared distances to
+    all points (r, n) in, their neighbors (r, k) out; all rows (n, k) back."""
     n = points.shape[0]
     rows = max(1, min(n, _BLOCK // n))
     blocks = -(-n // rows)
     queries = jnp.pad(points, ((0, blocks * rows - n), (0, 0)))
 
     def block(start):
-        row = (start + jnp.arange(rows, dtype=jnp.int32))[:, None]
         here = lax.dynamic_slice_in_dim(queries, start, rows)
+        # by differences: |a|^2 - 2ab + |b|^2 cancels to nothing for close points far from the
+        # origin
         square = sum((here[:, axis, None] - points[None, :, axis]) ** 2 for axis in range(3))
-        inside = (square <= radius * radius) & (row != jnp.arange(n, dtype=jnp.int32))
-        rank = jnp.arange(k, dtype=jnp.int32)[None, :]
-        found = _nth_set_bit(_pack(inside), jnp.broadcast_to(rank, (rows, k)))
-        return jnp.where(rank < jnp.sum(inside, axis=1, keepdims=True), found, row)
+        return choose((start + jnp.arange(rows, dtype=jnp.int32))[:, None], square)
 
     found = lax.map(block, rows * jnp.arange(blocks, dtype=jnp.int32))
-    return found.reshape(blocks * rows, k)[:n]
+    return found.reshape(blocks * rows, -1)[:n]
 
 
 def _k_smallest(values: Float[Array, "r n"], k: int) -> Int32[Array, "r k"]:

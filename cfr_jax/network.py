@@ -119,22 +119,30 @@ class AnnealingNet(nn.Module):
         mask = _join_masks(source, target, source_mask, target_mask)
         for i, width in enumerate((64, 64, 64, 128)):
             x = nn.relu(
-                apply_layer(self._layer(f"point_{i}", x, width), x, groups=GROUPS, mask=mask)
+                apply_layer(
+                    layer_of(self, f"point_{i}", x.shape[-1], width), x, groups=GROUPS, mask=mask
+                )
             )
-        x = pooled_layer(self._layer("point_4", x, 1024), x, groups=2 * GROUPS, mask=mask)[None]
+        x = pooled_layer(
+            layer_of(self, "point_4", x.shape[-1], 1024), x, groups=2 * GROUPS, mask=mask
+        )[None]
         for i, width in enumerate((512, 256)):
-            x = nn.relu(apply_layer(self._layer(f"pair_{i}", x, width), x, groups=2 * GROUPS))
+            x = nn.relu(
+                apply_layer(layer_of(self, f"pair_{i}", x.shape[-1], width), x, groups=2 * GROUPS)
+            )
         x = nn.softplus(nn.Dense(2 * self.iterations, kernel_init=kernel_init, name="out")(x)[0])
         return Annealing(beta=x[: self.iterations], alpha=x[self.iterations :])
 
-    def _layer(self, name, x, width):
-        kernel, bias = Linear(width, name=f"{name}_dense")(x.shape[-1])
-        scale = self.param(f"{name}_scale", nn.initializers.ones, (width,))
-        shift = self.param(f"{name}_shift", nn.initializers.zeros, (width,))
-        return Layer(kernel, bias, scale, shift)
+
+def layer_of(module: nn.Module, name: str, inputs: int, width: int) -> Layer:
+    """The parameters of a Linear and its GroupNorm, as `name` in a module under construction."""
+    kernel, bias = _Linear(width, name=f"{name}_dense")(inputs)
+    scale = module.param(f"{name}_scale", nn.initializers.ones, (width,))
+    shift = module.param(f"{name}_shift", nn.initializers.zeros, (width,))
+    return Layer(kernel, bias, scale, shift)
 
 
-class Linear(nn.Module):
+class _Linear(nn.Module):
     """The parameters of a Dense, for those who apply them in their own way."""
 
     width: int

@@ -19,9 +19,9 @@ from jaxtyping import Array, Float
 from cfr_jax import rigid, sinkhorn
 from cfr_jax.extraction import pooled_features
 from cfr_jax.features import raw_features
-from cfr_jax.layers import Layer, apply_layer
+from cfr_jax.layers import apply_layer
 from cfr_jax.neighbors import first_in_ball
-from cfr_jax.network import GROUPS, AnnealingNet, Linear, kernel_init, unit_rows
+from cfr_jax.network import GROUPS, AnnealingNet, kernel_init, layer_of, unit_rows
 from cfr_jax.registration import Cloud, Step, log_affinity
 
 _WIDTHS = (96, 96, 192)
@@ -46,19 +46,13 @@ class Features(nn.Module):
     def __call__(self, raw: Float[Array, "n k 10"]) -> Float[Array, "n 96"]:
         layers, width = [], raw.shape[-1]
         for i, wider in enumerate(_WIDTHS):
-            layers.append(self._layer(f"neighbor_{i}", width, wider))
+            layers.append(layer_of(self, f"neighbor_{i}", width, wider))
             width = wider
         x = pooled_features(tuple(layers), raw, groups=GROUPS)
         for i, wider in enumerate((192, _CHANNELS)):
-            layer = self._layer(f"point_{i}", x.shape[-1], wider)
+            layer = layer_of(self, f"point_{i}", x.shape[-1], wider)
             x = nn.relu(apply_layer(layer, x, groups=GROUPS))
         return unit_rows(nn.Dense(_CHANNELS, kernel_init=kernel_init, name="out")(x))
-
-    def _layer(self, name, width, wider):
-        kernel, bias = Linear(wider, name=f"{name}_dense")(width)
-        scale = self.param(f"{name}_scale", nn.initializers.ones, (wider,))
-        shift = self.param(f"{name}_shift", nn.initializers.zeros, (wider,))
-        return Layer(kernel, bias, scale, shift)
 
 
 class RPMNet(nn.Module):

@@ -150,7 +150,7 @@ def validate(params: dict, batch: dict) -> dict:
         "rotation_mean": float(rotation.mean()),
         "rotation_median": float(np.median(rotation)),
         "translation_mean": float(translation.mean()),
-        "recall_5deg_0.1": float(np.mean((rotation < 5) & (translation < 0.1))),
+        "recall_5deg_0.1": float(metrics.recalled(rotation, translation, 5.0, 0.1).mean()),
         "rotation_by_iteration": [
             float(metrics.err_r(transforms[:, i], truth).mean()) for i in range(transforms.shape[1])
         ],

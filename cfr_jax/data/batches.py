@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cfr_jax.data.corpus import Corpus
-from cfr_jax.data.protocol import crop, jitter, random_motion, resample
+from cfr_jax.data.protocol import crop, jitter, random_motion, resample, way_back
 from cfr_jax.neighbors import nearest_on_host
 
 
@@ -50,8 +50,6 @@ def draw_pair(corpus: Corpus, index: int, sampling: Sampling, rng: np.random.Gen
         rows.append(kept[resample(len(kept), sampling.points, rng)])
     motion = random_motion(sampling.angle, sampling.translation, rng)
     rotation, translation = motion[:3, :3], motion[:3, 3]
-    truth = np.eye(4, dtype=np.float32)
-    truth[:3, :3], truth[:3, 3] = rotation.T, -rotation.T @ translation
     source = jitter(points[rows[0]] @ rotation.T + translation, rng)
     target = jitter(points[rows[1]], rng)
     return {
@@ -61,7 +59,7 @@ def draw_pair(corpus: Corpus, index: int, sampling: Sampling, rng: np.random.Gen
         "target": target,
         "target_normals": normals[rows[1]],
         "target_neighbors": nearest_on_host(target, sampling.neighbors, radius=sampling.radius),
-        "transform": truth,
+        "transform": way_back(motion),
         "estimate_normals": rng.random() < sampling.estimated_normals,
     }
 

@@ -122,6 +122,14 @@ def random_motion(angle: float, translation: float, rng: Rng) -> Float32[np.ndar
     return motion.astype(np.float32)
 
 
+def way_back(motion: Float32[np.ndarray, "4 4"]) -> Float32[np.ndarray, "4 4"]:
+    """The inverse of a rigid motion, in its own float32: the truth that a pair is told."""
+    back = np.eye(4, dtype=np.float32)
+    back[:3, :3] = motion[:3, :3].T
+    back[:3, 3] = -motion[:3, :3].T @ motion[:3, 3]
+    return back
+
+
 def resample(size: int, count: int, rng: Rng) -> Int[np.ndarray, " count"]:
     """`count` of `size` rows, none twice; if there are too few, all of them and some again."""
     if count <= size:
@@ -174,16 +182,13 @@ def _make_pair(
     target_order = rng.permutation(len(target))
     source_order = rng.permutation(len(source))
 
-    back = np.eye(4, dtype=np.float32)
-    back[:3, :3] = rotation.T
-    back[:3, 3] = -rotation.T @ motion[:3, 3]
     return Pair(
         name=name,
         source=source[source_order],
         target=target[target_order],
         source_normals=moved_normals[source_rows][source_order],
         target_normals=normals[target_rows][target_order],
-        transform=back,
+        transform=way_back(motion),
         overlap=overlap,
         clean_source=moved,
         clean_target=points,
