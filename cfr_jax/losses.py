@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
 from cfr_jax import rigid
-from cfr_jax.registration import Cloud, Settings, Step, encode, iterate, iterations_of
+from cfr_jax.registration import Cloud, Step
 
 _DISCOUNT = 0.5  # the last iteration counts fully, each one before it half of the next
 _INLIER_WEIGHT = 0.01
@@ -33,28 +35,25 @@ class PairLoss:
 
 
 def pair_loss(
-    params: dict,
+    steps: Iterable[Step],
     source: Cloud,
     target: Cloud,
     truth: Float[Array, "4 4"],
     *,
     correspondence_weight: float,
-    settings: Settings,
 ) -> PairLoss:
-    """The paper's loss, and beside it a term for the correspondences themselves.
+    """The paper's loss of what a network found in its `steps`, and a term for the correspondences.
 
     Pose: mean |T_i x - T_truth x| over points and axes, plus 0.01 times the mean slack of both
     clouds, discounted by 0.5 per iteration before the last. Correspondence: see
     `correspondence_loss`; same discount. `truth` maps source onto target.
     """
-    iterations = iterations_of(params)
-    reference = encode(params, target, settings=settings)
+    steps = list(steps)
     there = rigid.apply(truth, source.points)
     spread = _squared_distances(there, target.points)
     pose = correspondence = 0.0
-    steps = list(iterate(params, source, reference, iterations, settings))
     for i, step in enumerate(steps):
-        discount = _DISCOUNT ** (iterations - 1 - i)
+        discount = _DISCOUNT ** (len(steps) - 1 - i)
         pose += discount * _pose_term(step, source.points, there)
         if correspondence_weight:
             correspondence += discount * correspondence_loss(step.log_affinity, spread)

@@ -220,6 +220,12 @@ def iterate(
         moved = rigid.apply(motion, source.points)
 
 
+def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> Iterator[Step]:
+    """The iterations that the parameters were made for, both clouds given as they are."""
+    reference = _encode(params, target, settings=settings)
+    return iterate(params, source, reference, iterations_of(params), settings)
+
+
 def log_affinity(
     source: Float[Array, "n d"], target: Float[Array, "m d"], beta: Array, alpha: Array
 ) -> Float[Array, "n m"]:

@@ -36,6 +36,7 @@ class Settings:
     neighbors: int = 64
     radius: float = 0.3
     passes: int = 5
+    iterations: int = 5
     optimized: bool = True
 
 
@@ -73,9 +74,7 @@ def init_params(key: jax.Array) -> dict:
     return RPMNet().init(key, raw, points, points)["params"]
 
 
-def iterate(
-    params: dict, source: Cloud, target: Cloud, iterations: int, settings: Settings
-) -> Iterator[Step]:
+def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> Iterator[Step]:
     """The iterations, one by one; clouds without masks, their `neighbors` are not used.
 
     As published, no gradient flows through the motion between two iterations.
@@ -84,7 +83,7 @@ def iterate(
     match = sinkhorn.match if settings.optimized else sinkhorn.match_in_log_space
     moved, normals = source.points, source.normals
     balls = None
-    for _ in range(iterations):
+    for _ in range(settings.iterations):
         if balls is None or not settings.optimized:
             balls = [
                 first_in_ball(lax.stop_gradient(points), settings.neighbors, settings.radius)

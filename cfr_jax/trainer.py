@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
+from collections.abc import Callable, Hashable
 from pathlib import Path
 
 import jax
@@ -12,13 +13,12 @@ import ml_collections
 import numpy as np
 import tqdm
 
-from cfr_jax import __version__, metrics, training, weights
+from cfr_jax import __version__, metrics, network, registration, rpmnet, training, weights
 from cfr_jax.checkpoints import Checkpoints
 from cfr_jax.data import protocol
 from cfr_jax.data.batches import Sampling, batches
 from cfr_jax.data.corpus import Corpus, read_corpus
 from cfr_jax.neighbors import nearest_on_host
-from cfr_jax.registration import Settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +31,36 @@ class Phase:
     batch: int
 
 
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """A network that can be trained, and how it is run in training and when it is validated."""
+
+    fresh: Callable[[jax.Array], dict]
+    unroll: training.Unroll
+    trained: Callable[[int], Hashable]
+    """Settings by the number of neighbors."""
+    validated: Hashable
+
+
+def learner(config: ml_collections.ConfigDict) -> Learner:
+    """The network that `config.network` names: "cfr", or "rpmnet" to compare with."""
+    if config.network == "cfr":
+        return Learner(
+            fresh=lambda key: network.init_params(key, config.iterations),
+            unroll=registration.unroll,
+            trained=lambda count: registration.Settings(neighbors=count, detach_motion=True),
+            validated=registration.Settings(),
+        )
+    if config.network == "rpmnet":
+        return Learner(
+            fresh=rpmnet.init_params,
+            unroll=rpmnet.unroll,
+            trained=lambda count: rpmnet.Settings(neighbors=count, iterations=config.iterations),
+            validated=rpmnet.Settings(),
+        )
+    raise ValueError(f"network: got {config.network!r}, wanted 'cfr' or 'rpmnet'")
+
+
 def run(config: ml_collections.ConfigDict, workdir: Path) -> dict:
     """Trains by `config` in `workdir`, going on where a checkpoint there left off.
 
@@ -38,11 +68,10 @@ def run(config: ml_collections.ConfigDict, workdir: Path) -> dict:
     `weights.safetensors` (the averaged weights of the best validation so far). Returns the best
     validation.
     """
+    chosen = learner(config)
     workdir.mkdir(parents=True, exist_ok=True)
     corpus = read_corpus(config.data.train)
-    held_out = validation_batch(
-        read_corpus(config.data.validation), config.validation_pairs, Settings()
-    )
+    held_out = validation_batch(read_corpus(config.data.validation), config.validation_pairs)
     phases = [Phase(**phase) for phase in config.phases]
     total = sum(phase.steps for phase in phases)
     optimizer = training.make_optimizer(
@@ -52,7 +81,7 @@ def run(config: ml_collections.ConfigDict, workdir: Path) -> dict:
         clip=config.train.clip,
         weight_decay=config.train.weight_decay,
     )
-    params = training.fresh_params(config.seed, config.iterations)
+    params = chosen.fresh(jax.random.key(config.seed))
     if config.train.start_from:
         params = weights.load_params(config.train.start_from)
     state = training.init_state(params, optimizer)
@@ -80,8 +109,9 @@ def run(config: ml_collections.ConfigDict, workdir: Path) -> dict:
                 state, measured = training.train_step(
                     state,
                     batch,
+                    unroll=chosen.unroll,
+                    settings=chosen.trained(phase.neighbors),
                     optimizer=optimizer,
-                    settings=Settings(neighbors=phase.neighbors, detach_motion=True),
                     correspondence_weight=config.train.correspondence_weight,
                     decay=config.train.average_decay,
                     pairs_at_once=config.train.pairs_at_once,
@@ -91,7 +121,7 @@ def run(config: ml_collections.ConfigDict, workdir: Path) -> dict:
                 if step % config.log_every == 0:
                     log.write(step, skipped=int(state.skipped))
                 if step % config.validate_every == 0 or step == total:
-                    found = validate(state.average, held_out)
+                    found = validate(chosen, state.average, held_out)
                     log.validation(step, found)
                     if found["rotation_mean"] < best.get("rotation_mean", np.inf):
                         best = {"step": step, **found}
@@ -122,8 +152,9 @@ def pairs_before(phases: list[Phase], step: int) -> int:
     return used
 
 
-def validation_batch(corpus: Corpus, count: int, settings: Settings) -> dict:
+def validation_batch(corpus: Corpus, count: int) -> dict:
     """The first pairs of the fixed partial protocol, spread over the corpus, as one batch."""
+    settings = registration.Settings()
     chosen = np.linspace(0, len(corpus) - 1, min(count, len(corpus))).astype(int)
     pairs = [protocol.fixed_pair(corpus, int(index), protocol.partial) for index in chosen]
     batch = {
@@ -140,9 +171,10 @@ def validation_batch(corpus: Corpus, count: int, settings: Settings) -> dict:
     return batch
 
 
-def validate(params: dict, batch: dict) -> dict:
+def validate(chosen: Learner, params: dict, batch: dict) -> dict:
     """Errors of the network alone on held-out pairs, at full size."""
-    transforms = np.asarray(training.predict(params, batch, settings=Settings()), np.float64)
+    transforms = training.predict(params, batch, unroll=chosen.unroll, settings=chosen.validated)
+    transforms = np.asarray(transforms, np.float64)
     truth = batch["transform"].astype(np.float64)
     rotation = metrics.err_r(transforms[:, -1], truth)
     translation = metrics.err_t(transforms[:, -1], truth)
@@ -172,6 +204,7 @@ class Log:
 
     def __init__(self, path: Path, total: int, step: int):
         self._path, self._waiting, self._since = path, [], time.perf_counter()
+        self._used, self._mark = 0.0, time.process_time()
         self._bar = tqdm.tqdm(total=total, initial=step, unit="step", mininterval=5)
 
     def training(self, step: int, measured) -> None:
@@ -182,7 +215,8 @@ class Log:
     def write(self, step: int, skipped: int) -> None:
         """Writes the mean of the steps since the last call."""
         mean = jax.tree.map(lambda *leaves: np.mean(np.stack(leaves), axis=0), *self._waiting)
-        now = time.perf_counter()
+        now, used = time.perf_counter(), time.process_time()
+        self._used, self._mark = self._used + used - self._mark, used
         line = {
             "step": step,
             "loss": float(mean.total),
@@ -193,6 +227,8 @@ class Log:
             "beta": mean.beta.tolist(),
             "alpha": mean.alpha.tolist(),
             "steps_per_second": len(self._waiting) / (now - self._since),
+            # of all threads, since this process started, without validations
+            "processor_seconds": self._used,
             "skipped": skipped,
         }
         self._waiting, self._since = [], now
@@ -208,6 +244,7 @@ class Log:
             f"step {step}: validation RE {found['rotation_mean']:.2f} mean, "
             f"{found['rotation_median']:.2f} median, recall {found['recall_5deg_0.1']:.2f}"
         )
+        self._since, self._mark = time.perf_counter(), time.process_time()
 
     def _append(self, line: dict) -> None:
         with self._path.open("a") as file:

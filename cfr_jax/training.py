@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Hashable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +12,11 @@ from flax import struct
 from jaxtyping import Array, Int
 
 from cfr_jax.losses import PairLoss, pair_loss
-from cfr_jax.network import init_params
 from cfr_jax.normals import estimate_normals
-from cfr_jax.registration import Cloud, Settings, register
+from cfr_jax.registration import Cloud, Step
+
+Unroll = Callable[[dict, Cloud, Cloud, Hashable], Iterator[Step]]
+"""The iterations of a network on a pair: `registration.unroll`, or `rpmnet.unroll`."""
 
 
 @struct.dataclass
@@ -56,22 +59,25 @@ def init_state(params: dict, optimizer: optax.GradientTransformation) -> TrainSt
     )
 
 
-def fresh_params(seed: int, iterations: int) -> dict:
-    """Parameters before any training."""
-    return init_params(jax.random.key(seed), iterations)
-
-
 @functools.partial(
     jax.jit,
-    static_argnames=("optimizer", "settings", "correspondence_weight", "decay", "pairs_at_once"),
+    static_argnames=(
+        "unroll",
+        "optimizer",
+        "settings",
+        "correspondence_weight",
+        "decay",
+        "pairs_at_once",
+    ),
     donate_argnames=("state",),
 )
 def train_step(
     state: TrainState,
     batch: dict,
     *,
+    unroll: Unroll,
+    settings: Hashable,
     optimizer: optax.GradientTransformation,
-    settings: Settings,
     correspondence_weight: float,
     decay: float,
     pairs_at_once: int,
@@ -84,13 +90,13 @@ def train_step(
     """
 
     def loss(params, pair):
+        source, target = (_cloud(pair, side) for side in ("source", "target"))
         measured = pair_loss(
-            params,
-            _cloud(pair, "source"),
-            _cloud(pair, "target"),
+            unroll(params, source, target, settings),
+            source,
+            target,
             pair["transform"],
             correspondence_weight=correspondence_weight,
-            settings=settings,
         )
         return measured.total, measured
 
@@ -142,12 +148,12 @@ def _cloud(pair, side):
     return Cloud(points, normals, neighbors)
 
 
-@functools.partial(jax.jit, static_argnames=("settings",))
-def predict(params: dict, batch: dict, *, settings: Settings) -> Array:
+@functools.partial(jax.jit, static_argnames=("unroll", "settings"))
+def predict(params: dict, batch: dict, *, unroll: Unroll, settings: Hashable) -> Array:
     """Transforms (b, L, 4, 4) of a batch that needs no training, pair after pair."""
 
     def of_pair(pair):
         source, target = (_cloud(pair, side) for side in ("source", "target"))
-        return register(params, source, target, settings=settings).transforms
+        return jnp.stack([step.transform for step in unroll(params, source, target, settings)])
 
     return jax.lax.map(of_pair, batch)

@@ -7,6 +7,7 @@ def get_config() -> ConfigDict:
     """Everything that `train.py` reads; override any field as --config.train.peak_rate=3e-4."""
     config = ConfigDict()
     config.seed = 0
+    config.network = "cfr"
     config.iterations = 5
 
     config.data = ConfigDict()

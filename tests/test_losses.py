@@ -10,7 +10,7 @@ from oracle import authors, cfr, clouds, pieces
 
 from cfr_jax.convert import from_state_dict
 from cfr_jax.losses import correspondence_loss, pair_loss
-from cfr_jax.registration import Settings, prepare
+from cfr_jax.registration import Settings, prepare, unroll
 
 SMALL = Settings(neighbors=6)
 N, M, L = 24, 28, 2
@@ -24,9 +24,14 @@ def measured(correspondence_weight):
         prepare(jnp.asarray(np.concatenate(part, axis=1)), settings=SMALL)
         for part in ((pair.x, pair.nx), (pair.y, pair.ny))
     )
-    loss = jax.jit(
-        functools.partial(pair_loss, correspondence_weight=correspondence_weight, settings=SMALL)
-    )(from_state_dict(state), source, target, jnp.asarray(pair.transform, jnp.float32))
+
+    @jax.jit
+    def loss_of(params, source, target, truth):
+        steps = unroll(params, source, target, SMALL)
+        return pair_loss(steps, source, target, truth, correspondence_weight=correspondence_weight)
+
+    truth = jnp.asarray(pair.transform, jnp.float32)
+    loss = loss_of(from_state_dict(state), source, target, truth)
     trace = cfr.trace(state, *pair[:4], iterations=L, neighbors=6)
     return loss, trace, pair
 

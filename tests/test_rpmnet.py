@@ -54,9 +54,8 @@ def test_it_answers_as_the_reference_in_both_forms(optimized):
         for points, normals in ((pair.x, pair.nx), (pair.y, pair.ny))
     )
 
-    steps = rpmnet.iterate(
-        parameters(state), source, target, 2, rpmnet.Settings(neighbors=20, optimized=optimized)
-    )
+    settings = rpmnet.Settings(neighbors=20, iterations=2, optimized=optimized)
+    steps = rpmnet.unroll(parameters(state), source, target, settings)
     found = np.stack([step.transform for step in steps])
 
     np.testing.assert_allclose(found, wanted, atol=1e-5)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from ml_collections import ConfigDict
 
-from cfr_jax import trainer, training, weights
+from cfr_jax import network, registration, trainer, training, weights
 from cfr_jax.checkpoints import Checkpoints
 from cfr_jax.data.batches import Sampling, batch_at
 from cfr_jax.data.corpus import read_corpus
-from cfr_jax.registration import Settings
 
 POINTS, NEIGHBORS, BATCH = 24, 6, 2
+SETTINGS = registration.Settings(neighbors=NEIGHBORS, detach_motion=True)
 make_optimizer = functools.cache(training.make_optimizer)  # the same one compiles once
 OPTIMIZER = make_optimizer(peak_rate=5e-3, steps=16, warmup=0.1, clip=1.0, weight_decay=1e-5)
 
@@ -53,7 +53,8 @@ def step(state, batch, pairs_at_once=1):
         state,
         batch,
         optimizer=OPTIMIZER,
-        settings=Settings(neighbors=NEIGHBORS, detach_motion=True),
+        unroll=registration.unroll,
+        settings=SETTINGS,
         correspondence_weight=0.05,
         decay=0.9,
         pairs_at_once=pairs_at_once,
@@ -61,7 +62,7 @@ def step(state, batch, pairs_at_once=1):
 
 
 def fresh():
-    return training.init_state(training.fresh_params(0, 1), OPTIMIZER)
+    return training.init_state(network.init_params(jax.random.key(0), 1), OPTIMIZER)
 
 
 def assert_same(tree, other):
@@ -120,7 +121,7 @@ def test_the_average_follows_the_parameters(batch):
 def config(corpus_file):
     """A run of 16 steps, compiled to the same program as the steps above."""
     given = ConfigDict()
-    given.seed, given.iterations = 0, 1
+    given.seed, given.network, given.iterations = 0, "cfr", 1
     given.data = {"train": str(corpus_file), "validation": str(corpus_file)}
     given.phases = (
         {"steps": 2, "points": POINTS, "neighbors": NEIGHBORS, "batch": BATCH},
@@ -143,7 +144,7 @@ class Killed(Exception):
 def run(corpus_file, folder):
     """A whole training, but for the validation: compiling that takes longer than all the rest."""
 
-    def validate(params, batch):
+    def validate(chosen, params, batch):
         change = np.sum(np.asarray(params["features"]["kernel_1"]) ** 2)
         return {"rotation_mean": float(change), "rotation_median": 0.0, "recall_5deg_0.1": 0.0}
 
@@ -161,7 +162,7 @@ def whole(corpus_file, tmp_path_factory):
 
 
 def state_of(workdir):
-    like = training.init_state(training.fresh_params(0, 1), OPTIMIZER)
+    like = training.init_state(network.init_params(jax.random.key(0), 1), OPTIMIZER)
     with Checkpoints(workdir / "checkpoints", keep=2) as checkpoints:
         return checkpoints.restore(like)[0]
 
@@ -211,7 +212,7 @@ def test_a_run_leaves_its_measurements_and_its_weights(whole):
 
 def test_validation_measures_the_last_transform(corpus_file, monkeypatch):
     corpus = read_corpus(corpus_file)
-    held_out = trainer.validation_batch(corpus, 3, Settings())
+    held_out = trainer.validation_batch(corpus, 3)
     assert held_out["source"].shape == (3, 717, 3)
     assert held_out["source_neighbors"].shape == (3, 717, 64)
     off = np.array(held_out["transform"], np.float32)[:, None].repeat(2, axis=1)
@@ -219,7 +220,7 @@ def test_validation_measures_the_last_transform(corpus_file, monkeypatch):
     off[0, 1, 0, 3] += 0.5
     monkeypatch.setattr(training, "predict", lambda *_, **__: jnp.asarray(off))
 
-    found = trainer.validate({}, held_out)
+    found = trainer.validate(trainer.learner(config("")), {}, held_out)
 
     np.testing.assert_allclose(found["translation_mean"], 0.5 / 3, rtol=1e-4)
     np.testing.assert_allclose(found["recall_5deg_0.1"], 2 / 3)
@@ -227,13 +228,16 @@ def test_validation_measures_the_last_transform(corpus_file, monkeypatch):
 
 
 def test_prediction_answers_pair_after_pair(batch):
-    params = training.fresh_params(0, 1)
+    params = network.init_params(jax.random.key(0), 1)
+    predict = functools.partial(
+        training.predict, params, unroll=registration.unroll, settings=SETTINGS
+    )
 
-    found = training.predict(params, batch, settings=Settings(neighbors=NEIGHBORS))
+    found = predict(batch)
 
     assert found.shape == (BATCH, 1, 4, 4)
     backwards = jax.tree.map(lambda leaf: leaf[::-1], batch)
-    swapped = training.predict(params, backwards, settings=Settings(neighbors=NEIGHBORS))
+    swapped = predict(backwards)
     np.testing.assert_allclose(swapped[::-1], found, atol=1e-6)
 
 
