@@ -50,8 +50,9 @@ def test_a_bad_cloud_is_refused_by_name(name, bad, told):
 @pytest.mark.parametrize(
     "initial",
     [
-        "global",
+        "everywhere",
         [[1, 2], [3]],
+        np.zeros((0, 4, 4)),
         {"transform": 1},
         np.eye(3),
         np.full((4, 4), np.nan),

@@ -29,6 +29,8 @@ LAYERS = (
     ("data", "viewer"),
     ("trainer", "baselines"),
     ("preparation", "confidence"),
+    ("planning",),
+    ("solving", "doubts"),
     ("alignment",),
     ("evaluation",),
     ("cli",),

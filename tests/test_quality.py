@@ -10,7 +10,7 @@ import pytest
 import solids
 from scipy.spatial import cKDTree
 
-from cfr_jax import alignment, quality
+from cfr_jax import doubts, quality
 from cfr_jax.io import PointCloud
 from cfr_jax.normals import estimate_normals
 from cfr_jax.preparation import to_unit, unit_frames
@@ -83,22 +83,22 @@ def test_what_slides_or_turns_freely_hardly_resists(shape, noise):
     found = [measured(*two_samplings(SHAPES[shape], seed, noise)) for seed in range(4)]
 
     weakest = [one.resistance.min() for one in found]
-    assert max(weakest) < alignment._FREE
-    assert np.median(weakest) < alignment._FREE / 2
+    assert max(weakest) < doubts.FREE
+    assert np.median(weakest) < doubts.FREE / 2
 
 
 @pytest.mark.parametrize("shape", ["plane", "cylinder", "line"])
 def test_the_very_same_samples_do_not_hold_a_free_shape(shape):
     points = SHAPES[shape](500, 0).points
 
-    assert measured(points, points).resistance.min() < alignment._FREE
+    assert measured(points, points).resistance.min() < doubts.FREE
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.005])
 def test_a_lopsided_shape_resists(noise):
     found = [measured(*two_samplings(solids.lopsided, seed, noise)) for seed in range(4)]
 
-    assert min(one.resistance.min() for one in found) > 1.25 * alignment._FREE
+    assert min(one.resistance.min() for one in found) > 1.25 * doubts.FREE
 
 
 def test_resistance_does_not_depend_on_where_the_shape_lies():

@@ -1,0 +1,106 @@
+"""A pair made ready on the host: read, checked, centered, scaled and thinned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cfr_jax import preparation
+from cfr_jax.io import PointCloud, as_point_cloud
+from cfr_jax.registration import Settings
+
+DEFAULT_BUDGET = 1024
+SETTINGS = Settings()
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What `align` does before the device is asked."""
+
+    frames: preparation.Frames
+    source: preparation.UnitCloud
+    target: preparation.UnitCloud
+
+
+def read_clouds(source: Any, target: Any) -> tuple[PointCloud, PointCloud]:
+    """Both as clouds; raises ValueError, by name, for what is none or has too few points."""
+    clouds = as_point_cloud(source, name="source"), as_point_cloud(target, name="target")
+    for cloud, name in zip(clouds, ("source", "target"), strict=True):
+        if len(cloud.points) < 3:
+            raise ValueError(f"{name}: got {len(cloud.points)} points, wanted at least 3")
+    return clouds
+
+
+def planned(
+    source: Any,
+    target: Any,
+    *,
+    initial: Float[np.ndarray, "4 4"] | None = None,
+    max_points: int | None = None,
+    seed: int = 0,
+    settings: Settings = SETTINGS,
+) -> Plan:
+    """Reads, centers, scales and thins a pair; arguments and errors are those of `align`."""
+    source, target = read_clouds(source, target)
+    if initial is not None:
+        motions = rigid_motions(initial)
+        if len(motions) > 1:
+            raise ValueError(f"initial: got {len(motions)} motions, wanted one")
+        initial = motions[0]
+    budget = DEFAULT_BUDGET if max_points is None else whole("max_points", max_points, least=3)
+    seed = whole("seed", seed, least=0)
+    frames = preparation.unit_frames(source, target, initial)
+    units = (
+        preparation.to_unit(
+            cloud,
+            center,
+            frames.scale,
+            motion,
+            budget=budget,
+            neighbors=settings.neighbors,
+            radius=settings.radius,
+            seed=seed,
+        )
+        for cloud, center, motion in (
+            (source, frames.source_center, frames.initial),
+            (target, frames.target_center, np.eye(4)),
+        )
+    )
+    return Plan(frames, *units)
+
+
+def whole(name: str, value: Any, *, least: int) -> int:
+    """`value` if it is a whole number of at least `least`; else a ValueError with the name."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name}: got {value!r}, wanted a whole number of at least {least}")
+    return int(value)
+
+
+def rigid_motions(initial: Any) -> Float[np.ndarray, "k 4 4"]:
+    """One or several initial motions, float64; raises ValueError for anything else."""
+    try:
+        motions = np.asarray(initial, np.float64)
+    except (TypeError, ValueError):
+        what = repr(initial) if isinstance(initial, str) else f"a {type(initial).__name__}"
+        raise ValueError(
+            f"initial: got {what} that is no array of numbers, "
+            'wanted "global", a (4, 4) matrix, or several as (k, 4, 4)'
+        ) from None
+    if motions.ndim not in (2, 3) or motions.shape[-2:] != (4, 4) or not motions.size:
+        raise ValueError(f"initial: got shape {motions.shape}, wanted (4, 4) or (k, 4, 4)")
+    if not np.isfinite(motions).all():
+        raise ValueError("initial: got numbers that are not finite, wanted a rigid motion")
+    motions = motions.reshape(-1, 4, 4)
+    rotations = motions[:, :3, :3]
+    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
+    last = np.abs(motions[:, 3] - [0, 0, 0, 1]).max()
+    if off > 1e-3 or (np.linalg.det(rotations) < 0).any() or last > 1e-6:
+        raise ValueError(
+            "initial: got a matrix that is no rigid motion, wanted a proper rotation "
+            "and a last row 0 0 0 1"
+        )
+    return motions

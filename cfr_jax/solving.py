@@ -1,0 +1,104 @@
+"""What `align` runs on the device: the network, the refinement, and what their answer is worth.
+
+Pure functions of one pair of unit clouds; batches are `vmap`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from cfr_jax import confidence, quality, refinement
+from cfr_jax.planning import SETTINGS
+from cfr_jax.preparation import UnitCloud
+from cfr_jax.refinement import Surface
+from cfr_jax.registration import Cloud, Encoded, Registration, encode, prepare, register
+
+DISTANCE = refinement.CUT
+
+
+@struct.dataclass
+class Found:
+    """What comes back from the device; batched after `vmap`."""
+
+    registration: Registration
+    transform: Float[Array, "*batch 4 4"]
+    """Maps the source, as it was handed over, onto the target."""
+    improved: Bool[Array, "*batch"]
+    """Whether `transform` is not the network's last, but one that fits no worse."""
+    converged: Bool[Array, "*batch"]
+    steps: Int[Array, "*batch"]
+    quality: quality.Quality
+    clues: confidence.Clues
+
+
+def solve(params: dict, source: Cloud, target: Encoded, *, refine: bool) -> Found:
+    """The device's part for one pair of unit clouds: registered, refined, judged.
+
+    Refining never answers worse, by its own score, than the network did or than the source lay
+    when it came: a start that fits better than all that was found from it stands.
+    """
+    registration = register(params, source, target, settings=SETTINGS)
+    surfaces = surface(source), surface(target.cloud)
+    transform = registration.transform
+    improved = converged = jnp.array(False)
+    steps = jnp.zeros((), jnp.int32)
+    if refine:
+        refined = refinement.refine(*surfaces, transform)
+        start = jnp.eye(4, dtype=transform.dtype)
+        kept, moved = (
+            refinement.score(*surfaces, motion, DISTANCE) for motion in (start, refined.transform)
+        )
+        stays = kept < moved
+        transform = jnp.where(stays, start, refined.transform)
+        improved, steps = refined.improved | stays, refined.steps
+        converged = refined.converged
+    measured = quality.measure(*surfaces, transform, DISTANCE)
+    clues = confidence.gather(registration, *surfaces, transform, measured)
+    return Found(registration, transform, improved, converged, steps, measured, clues)
+
+
+def surface(cloud: Cloud) -> Surface:
+    """A prepared cloud as the refinement sees it."""
+    mask = jnp.ones(cloud.points.shape[0], bool) if cloud.mask is None else cloud.mask
+    return Surface(cloud.points, cloud.normals, mask)
+
+
+def on_device(unit: UnitCloud) -> dict[str, jax.Array]:
+    """The arguments of `registration.prepare` for a unit cloud."""
+    points = unit.points if unit.normals is None else np.hstack([unit.points, unit.normals])
+    return {
+        "points": jnp.asarray(points),
+        "neighbors": jnp.asarray(unit.neighbors),
+        "mask": jnp.asarray(unit.mask),
+    }
+
+
+@functools.partial(jax.jit, static_argnames=("refine",))
+def solve_pair(
+    params: dict, source: dict[str, jax.Array], target: dict[str, jax.Array], *, refine: bool
+) -> Found:
+    """`solve` for two clouds as `on_device` hands them over."""
+    source, target = (prepare(**cloud, settings=SETTINGS) for cloud in (source, target))
+    return solve(params, source, encode(params, target, settings=SETTINGS), refine=refine)
+
+
+def compiled(function: Callable, *arguments: Any, **static: Any) -> Callable:
+    """The compiled program of a jitted function for arguments of these sizes, made once, so that
+    compiling can be timed apart from running."""
+    leaves, structure = jax.tree.flatten(arguments)
+    shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+    return _program(function, tuple(static.items()), structure, shapes)
+
+
+@functools.lru_cache(maxsize=64)
+def _program(function, static, structure, shapes):
+    arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    return function.lower(*arguments, **dict(static)).compile()
