@@ -46,7 +46,8 @@ def pair_loss(
 
     Pose: mean |T_i x - T_truth x| over points and axes, plus 0.01 times the mean slack of both
     clouds, discounted by 0.5 per iteration before the last. Correspondence: see
-    `correspondence_loss`; same discount. `truth` maps source onto target.
+    `correspondence_loss`; same discount; it stores the affinities, however they were matched.
+    `truth` maps source onto target.
     """
     steps = list(steps)
     there = rigid.apply(truth, source.points)
@@ -56,7 +57,7 @@ def pair_loss(
         discount = _DISCOUNT ** (len(steps) - 1 - i)
         pose += discount * _pose_term(step, source.points, there)
         if correspondence_weight:
-            correspondence += discount * correspondence_loss(step.log_affinity, spread)
+            correspondence += discount * correspondence_loss(step.affinity.log(), spread)
     transforms = jnp.stack([step.transform for step in steps])
     return PairLoss(
         total=pose + correspondence_weight * correspondence,
@@ -64,8 +65,8 @@ def pair_loss(
         correspondence=correspondence,
         rotation_error=jax.vmap(rigid.rotation_error, (0, None))(transforms, truth),
         translation_error=jax.vmap(rigid.translation_error, (0, None))(transforms, truth),
-        beta=jnp.stack([step.beta for step in steps]),
-        alpha=jnp.stack([step.alpha for step in steps]),
+        beta=jnp.stack([step.affinity.beta for step in steps]),
+        alpha=jnp.stack([step.affinity.alpha for step in steps]),
     )
 
 

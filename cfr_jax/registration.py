@@ -24,9 +24,7 @@ from cfr_jax import rigid
 from cfr_jax.features import PairFeature, raw_features
 from cfr_jax.network import CFR
 from cfr_jax.normals import estimate_normals
-from cfr_jax.sinkhorn import Match, match
-
-_HIGHEST = lax.Precision.HIGHEST
+from cfr_jax.sinkhorn import Affinity, Form, Match, match
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +35,9 @@ class Settings:
     radius: float = 0.3
     """Neighbors further away are replaced by the nearest one; in units of the unit sphere."""
     ppf: PairFeature = "dot"
+    match: Form = "auto"
+    """How correspondences are found: "dense" stores the N x M affinities, "streamed" makes them
+    anew whenever it needs them, "auto" streams what is large. "log space" is RPM-Net's."""
     detach_motion: bool = False
     """Stop gradients at the motion between iterations, as the paper trains."""
 
@@ -173,8 +174,8 @@ def _register(params, source, target, *, iterations, settings):
         weights=steps[-1].match.weights,
         covered=steps[-1].match.covered,
         targets=steps[-1].match.targets,
-        beta=jnp.stack([step.beta for step in steps]),
-        alpha=jnp.stack([step.alpha for step in steps]),
+        beta=jnp.stack([step.affinity.beta for step in steps]),
+        alpha=jnp.stack([step.affinity.alpha for step in steps]),
     )
 
 
@@ -183,9 +184,7 @@ class Step(NamedTuple):
 
     transform: Float[Array, "4 4"]
     match: Match
-    log_affinity: Float[Array, "n m"]
-    beta: Float[Array, ""]
-    alpha: Float[Array, ""]
+    affinity: Affinity
 
 
 def iterate(
@@ -205,17 +204,19 @@ def iterate(
         layer = min(i, count - 1)
         received = features if i == layer else received
         features = network.cascade.layer(layer, received, moved, source.mask)
-        beta, alpha = annealing.beta[layer], annealing.alpha[layer]
-        affinity = log_affinity(features, target.features[layer], beta, alpha)
+        affinity = Affinity(
+            features, target.features[layer], annealing.beta[layer], annealing.alpha[layer]
+        )
         found = match(
             affinity,
             reference.points,
             passes=layer + 1,
+            form=settings.match,
             source_mask=source.mask,
             target_mask=reference.mask,
         )
         transform = rigid.fit_rigid(source.points, found.targets, found.weights)
-        yield Step(transform, found, affinity, beta, alpha)
+        yield Step(transform, found, affinity)
         motion = lax.stop_gradient(transform) if settings.detach_motion else transform
         moved = rigid.apply(motion, source.points)
 
@@ -224,14 +225,6 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> It
     """The iterations that the parameters were made for, both clouds given as they are."""
     reference = _encode(params, target, settings=settings)
     return iterate(params, source, reference, iterations_of(params), settings)
-
-
-def log_affinity(
-    source: Float[Array, "n d"], target: Float[Array, "m d"], beta: Array, alpha: Array
-) -> Float[Array, "n m"]:
-    """-beta (|f_x - f_y|^2 - alpha) for unit features."""
-    square = 2 - 2 * jnp.matmul(source, target.T, precision=_HIGHEST)
-    return -beta * (square - alpha)
 
 
 def iterations_of(params: dict) -> int:

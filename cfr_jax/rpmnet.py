@@ -16,13 +16,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from cfr_jax import rigid, sinkhorn
+from cfr_jax import rigid
 from cfr_jax.extraction import pooled_features
 from cfr_jax.features import raw_features
 from cfr_jax.layers import apply_layer
 from cfr_jax.neighbors import first_in_ball
 from cfr_jax.network import GROUPS, AnnealingNet, kernel_init, layer_of, unit_rows
-from cfr_jax.registration import Cloud, Step, log_affinity
+from cfr_jax.registration import Cloud, Step
+from cfr_jax.sinkhorn import Affinity, match
 
 _WIDTHS = (96, 96, 192)
 _CHANNELS = 96
@@ -80,7 +81,7 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> It
     As published, no gradient flows through the motion between two iterations.
     """
     network = RPMNet().bind({"params": params})
-    match = sinkhorn.match if settings.optimized else sinkhorn.match_in_log_space
+    form = "auto" if settings.optimized else "log space"
     moved, normals = source.points, source.normals
     balls = None
     for _ in range(settings.iterations):
@@ -96,11 +97,10 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> It
                 ((moved, normals), (target.points, target.normals)), balls, strict=True
             )
         ]
-        beta, alpha = annealing.beta[0], annealing.alpha[0]
-        affinity = log_affinity(*features, beta, alpha)
-        found = match(affinity, target.points, passes=settings.passes)
+        affinity = Affinity(*features, annealing.beta[0], annealing.alpha[0])
+        found = match(affinity, target.points, passes=settings.passes, form=form)
         transform = rigid.fit_rigid(source.points, found.targets, found.weights)
-        yield Step(transform, found, affinity, beta, alpha)
+        yield Step(transform, found, affinity)
         motion = lax.stop_gradient(transform)
         moved = rigid.apply(motion, source.points)
         normals = rigid.rotate(motion, source.normals)

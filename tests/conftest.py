@@ -27,12 +27,13 @@ def pytest_configure(config):
 def pytest_sessionstart():
     # The fields of a result state the shapes of one pair. Coming out of vmap or a scan it is made
     # anew, with one more axis in front or with placeholders, and that is no mistake.
-    from cfr_jax import losses, registration, training
+    from cfr_jax import losses, registration, sinkhorn, training
 
     for kind in (
         registration.Cloud,
         registration.Encoded,
         registration.Registration,
+        sinkhorn.Affinity,
         losses.PairLoss,
         training.TrainState,
     ):
