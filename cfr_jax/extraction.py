@@ -2,15 +2,15 @@
 
 Three layers of Linear, GroupNorm and ReLU see n k rows per cloud, and the norm's statistics run
 over all of them, so the plain form writes and reads n k 96 floats eight times, and four times that
-for its gradient. Here no activation of that size is ever stored: tiles of points stay in a core's
-cache.
+for its gradient. Here no activation of that size is ever stored: tiles of points stay in a cache.
 
 - The first layer's statistics follow exactly from the mean and covariance of the seven raw
   channels.
 - One pass over the tiles sums the second layer's output for its statistics.
 - A second pass, the first two norms folded into their weights, sums the third layer's output and
-  keeps its largest and smallest value over the neighbors. The norm and the ReLU are monotonic per
-  channel, so the pooled feature is one of these two, normalized.
+  keeps its largest value over the neighbors. The norm and the ReLU are monotonic per channel, so
+  the pooled feature is that value, normalized. (Where the norm's scale is negative it is the
+  smallest value: the sign is folded into the weights.)
 
 The gradient is written out for the same reason. Through a norm it is the incoming gradient minus
 its projections on 1 and on the normalized values, and both projections are sums over rows: the last
@@ -28,7 +28,10 @@ from jaxtyping import Array, Bool, Float
 
 from cfr_jax.layers import Layer, fold, norm_of, projections
 
-_TILE_ROWS = 4096  # rows of 96 floats: 1.5 MB, the activations of one tile in a core's cache
+# Rows of 96 floats in flight, so that a tile's activations stay in a cache: two or three of them at
+# a time forward, about eight backward.
+_FORWARD_ROWS = 8192
+_BACKWARD_ROWS = 4096
 
 
 def pooled_features(
@@ -55,35 +58,36 @@ def _pooled(layers, raw, valid, groups):
 
 def _forward(layers, raw, valid, groups):
     one, two, three = layers
-    n, k, channels = raw.shape
-    tiles, weights = _tiles(raw, valid)
+    n, k, _ = raw.shape
+    count = -(-n * k // _FORWARD_ROWS)
+    tiles = _cut(raw, count).reshape(count, -1, raw.shape[-1])
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
 
     norm_one = norm_of(*_moments_of_first(one, raw, valid, rows), groups)
     kernel_one, bias_one = fold(one, norm_one)
 
-    def statistics(sums, tile):
-        raw, weight = tile
+    # Both passes leave sums per point, and the mask weighs them afterwards: reductions that follow
+    # a product directly are fused into it on CPU, and its output is never written.
+    def statistics(_, raw):
         z = jax.nn.relu(raw @ kernel_one + bias_one) @ two.kernel
-        return _add_sums(sums, z, weight), None
+        return None, _sums_of_neighbors(z, k)
 
-    zeros = jnp.zeros((2, two.bias.size), raw.dtype)
-    sums, _ = lax.scan(statistics, zeros, (tiles, weights))
-    norm_two = norm_of(*_moments(sums, rows, two.bias), groups)
+    _, sums = lax.scan(statistics, None, tiles)
+    norm_two = norm_of(*_moments(sums, valid, rows, two.bias), groups)
     kernel_two, bias_two = fold(two, norm_two)
 
-    def extremes(sums, tile):
-        raw, weight = tile
-        y = jax.nn.relu(raw @ kernel_one + bias_one)
-        z = jax.nn.relu(y @ kernel_two + bias_two) @ three.kernel
-        each = z.reshape(-1, k, z.shape[-1])
-        return _add_sums(sums, z, weight), (each.max(1), each.min(1))
+    # under a negative scale the smallest value becomes the largest
+    sign = jnp.where(three.scale >= 0, 1, -1).astype(raw.dtype)
+    kernel_three = three.kernel * sign
 
-    zeros = jnp.zeros((2, three.bias.size), raw.dtype)
-    sums, (high, low) = lax.scan(extremes, zeros, (tiles, weights))
-    norm_three = norm_of(*_moments(sums, rows, three.bias), groups)
-    high, low = (e.reshape(-1, e.shape[-1])[:n] + three.bias for e in (high, low))
-    extreme = jnp.where(three.scale >= 0, high, low)
+    def extremes(_, raw):
+        y = jax.nn.relu(raw @ kernel_one + bias_one)
+        z = jax.nn.relu(y @ kernel_two + bias_two) @ kernel_three
+        return None, (_sums_of_neighbors(z, k), z.reshape(-1, k, z.shape[-1]).max(1))
+
+    _, (sums, high) = lax.scan(extremes, None, tiles)
+    norm_three = norm_of(*_moments(sums, valid, rows, three.bias, sign), groups)
+    extreme = high.reshape(-1, high.shape[-1])[:n] * sign + three.bias
     normal = (extreme - norm_three.mean) * norm_three.rate
     pooled = jax.nn.relu(normal * three.scale + three.shift)
     return pooled, (layers, raw, valid, (norm_one, norm_two, norm_three), normal)
@@ -94,7 +98,9 @@ def _backward(groups, residuals, gradient):
     one, two, three = layers
     n, k, channels = raw.shape
     width = three.bias.size
-    tiles, weights = _tiles(raw, valid)
+    count = -(-n * k // _BACKWARD_ROWS)
+    tiles = _cut(raw, count).reshape(count, -1, channels)
+    weights = jnp.repeat(_cut(valid, count), k, axis=1)
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
     kernel_first, bias_first = fold(one, norm_one)
 
@@ -105,7 +111,7 @@ def _backward(groups, residuals, gradient):
     shift_three, scale_three = gradient.sum(0), (gradient * normal).sum(0)
     flat_three, tilt_three = projections(three, shift_three, scale_three, rows, groups)
     at_extreme = gradient * three.scale * norm_three.rate
-    at_extreme = _cut(at_extreme, tiles.shape[0])
+    at_extreme = _cut(at_extreme, count)
 
     def through_three(sums, tile):
         raw, weight, incoming = tile
@@ -182,28 +188,23 @@ def _backward(groups, residuals, gradient):
 _pooled.defvjp(_forward, _backward)
 
 
-def _tiles(raw, valid):
-    """Points cut into tiles, padded to whole ones: (t, rows, c) values and (t, rows) weights."""
-    n, k, c = raw.shape
-    count = -(-n * k // _TILE_ROWS)
-    weights = jnp.repeat(_cut(valid, count), k, axis=1)
-    return _cut(raw, count).reshape(count, -1, c), weights
-
-
 def _cut(values, count):
+    """Points cut into `count` tiles, padded to whole ones: (count, size, ...)."""
     n = values.shape[0]
     size = -(-n // count)
     pad = [(0, count * size - n)] + [(0, 0)] * (values.ndim - 1)
     return jnp.pad(values, pad).reshape(count, size, *values.shape[1:])
 
 
-def _add_sums(sums, z, weight):
-    return sums + jnp.stack([weight @ z, weight @ (z * z)])
+def _sums_of_neighbors(z, k):
+    each = z.reshape(-1, k, z.shape[-1])
+    return each.sum(1), (each * each).sum(1)
 
 
-def _moments(sums, rows, bias):
-    mean = sums[0] / rows
-    return mean + bias, sums[1] / rows - mean * mean
+def _moments(sums, valid, rows, bias, sign=1):
+    """Mean and variance of a layer's output from each point's sums over its neighbors."""
+    total, square = (valid @ each.reshape(-1, bias.size)[: valid.size] / rows for each in sums)
+    return total * sign + bias, square - total * total
 
 
 def _moments_of_first(layer, raw, valid, rows):

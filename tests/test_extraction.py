@@ -46,7 +46,8 @@ def tiled(layers, raw, mask=None):
 
 @pytest.fixture(params=[4096, 3 * K], ids=["one tile", "four tiles, the last not full"])
 def tiles(request, monkeypatch):
-    monkeypatch.setattr(extraction, "_TILE_ROWS", request.param)
+    monkeypatch.setattr(extraction, "_FORWARD_ROWS", request.param)
+    monkeypatch.setattr(extraction, "_BACKWARD_ROWS", request.param)
 
 
 MASK = jnp.arange(N) % 3 != 1

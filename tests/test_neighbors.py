@@ -7,6 +7,7 @@ import pytest
 from oracle import cfr, pieces
 from scipy.spatial import cKDTree
 
+from cfr_jax import neighbors
 from cfr_jax.neighbors import closest, nearest, nearest_on_host
 
 on_device = jax.jit(nearest, static_argnames=("k", "radius"))
@@ -26,16 +27,23 @@ CLOUDS = {
 }
 
 
+@pytest.fixture(params=["all pairs", "tree"])
+def on_host(request, monkeypatch):
+    """The host's search, for small clouds and for large ones."""
+    monkeypatch.setattr(neighbors, "_FEW", 10**9 if request.param == "all pairs" else 0)
+    return nearest_on_host
+
+
 def sets(rows):
     return np.sort(np.asarray(rows), axis=1)
 
 
 @pytest.mark.parametrize("k", [1, 12, 124])
 @pytest.mark.parametrize("name", CLOUDS)
-def test_device_and_host_find_the_sets_of_the_plain_search(name, k):
+def test_device_and_host_find_the_sets_of_the_plain_search(name, k, on_host):
     points = CLOUDS[name](np.random.default_rng(0)).astype(np.float32)
 
-    device, host = on_device(jnp.asarray(points), k), nearest_on_host(points, k)
+    device, host = on_device(jnp.asarray(points), k), on_host(points, k)
 
     wanted = sets(pieces.nearest_neighbors(points, k))
     np.testing.assert_array_equal(sets(device), wanted)
@@ -43,12 +51,12 @@ def test_device_and_host_find_the_sets_of_the_plain_search(name, k):
 
 
 @pytest.mark.parametrize("name", ["random", "lattice", "duplicates"])
-def test_neighbors_beyond_the_radius_become_the_nearest(name):
+def test_neighbors_beyond_the_radius_become_the_nearest(name, on_host):
     points = CLOUDS[name](np.random.default_rng(1)).astype(np.float32)
     points[7] += 4  # all alone: its nearest stays
 
     device = on_device(jnp.asarray(points), 20, radius=0.3)
-    host = nearest_on_host(points, 20, radius=0.3)
+    host = on_host(points, 20, radius=0.3)
 
     wanted = sets(cfr.find_neighbors(points, 20, 0.3))
     assert len(set(wanted[7])) == 1 and (wanted != sets(pieces.nearest_neighbors(points, 20))).any()
