@@ -24,6 +24,7 @@ INSTALLED_AS = {
     "orbax": "orbax-checkpoint",
     "small_gicp": "small-gicp",
     "kiss_matcher": "kiss-matcher",
+    "rerun": "rerun-sdk",
 }
 
 
@@ -119,7 +120,7 @@ def test_what_files_import_at_once_is_installed_always():
 def test_what_files_import_when_they_run_is_installed_by_a_dependency_or_an_extra():
     # given
     extras = PROJECT["optional-dependencies"]
-    offered = {name for key in ("io", "baselines", "viz", "torch") for name in extras[key]}
+    offered = {name for key in ("io", "baselines", "viz", "torch", "rerun") for name in extras[key]}
 
     # when
     needed = third_party_imports(at_the_top=False)
@@ -144,4 +145,4 @@ def test_every_extra_that_a_message_names_exists():
         )
         for extra in match.split(",")
     }
-    assert {"io", "viz", "torch"} <= named <= set(PROJECT["optional-dependencies"])
+    assert {"io", "viz", "torch", "rerun"} <= named <= set(PROJECT["optional-dependencies"])

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from cfr_jax import __version__
-from cfr_jax.cli import convert, data, demo, register
+from cfr_jax.cli import convert, data, demo, register, view
 
-_COMMANDS = (register, demo, convert, data)
+_COMMANDS = (register, view, demo, convert, data)
 
 _DESCRIPTION = """\
 Registers 3D point clouds: finds the rigid motion that lays one cloud on another.

@@ -7,11 +7,16 @@ import os
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cfr_jax.viewer import Scene
 
 # What `cfr_jax.io.write` can write; a test holds the two together.
 CLOUD_SUFFIXES = (".ply", ".pcd", ".xyz", ".txt", ".npy", ".npz")
 PAGE_SUFFIXES = (".html", ".htm")
 PICTURE_SUFFIXES = (".png",)
+RECORDING_SUFFIXES = (".rrd",)
 
 
 def check_output(option: str, path: Path, suffixes: tuple[str, ...] = ()) -> None:
@@ -47,3 +52,26 @@ def check_apart(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
 def can_draw() -> bool:
     """Whether pictures can be written: they need matplotlib."""
     return importlib.util.find_spec("matplotlib") is not None
+
+
+def check_library(option: str, path: Path) -> None:
+    """Raises ValueError, naming the option and the extra, if what draws such a file is missing."""
+    suffix = path.suffix.lower()
+    if suffix in PICTURE_SUFFIXES and not can_draw():
+        raise ValueError(f'{option}: pictures need matplotlib: pip install "cfr_jax[viz]"')
+    if suffix in RECORDING_SUFFIXES and importlib.util.find_spec("rerun") is None:
+        raise ValueError(f'{option}: recordings need rerun: pip install "cfr_jax[rerun]"')
+
+
+def draw(scene: Scene, paths: Iterable[Path]) -> None:
+    """Draws `scene` into each file, the form told by the suffix."""
+    from cfr_jax import viewer
+
+    for path in paths:
+        suffix = path.suffix.lower()
+        if suffix in PICTURE_SUFFIXES:
+            viewer.write_picture(path, scene)
+        elif suffix in RECORDING_SUFFIXES:
+            viewer.write_recording(path, scene)
+        else:
+            viewer.write_page(path, scene)

@@ -148,7 +148,8 @@ def run(args: argparse.Namespace) -> int:
         document = report.as_document(result, str(args.source), str(args.target))
         _write_json(None if to_stdout else args.json, document)
     if args.view is not None or args.png is not None:
-        _write_pictures(args, report.as_scene(result))
+        pictures = [path for path in (args.view, args.png) if path is not None]
+        outputs.draw(report.as_scene(result), pictures)
 
     for warning in result.alignment.warnings if to_stdout else ():
         print(f"cfr register: warning: {warning}", file=sys.stderr)
@@ -171,8 +172,8 @@ def _check_outputs(args: argparse.Namespace, to_stdout: bool) -> None:
         outputs.check_output(option, path, suffixes)
     inputs = [path for path in (args.source, args.target, args.initial) if path is not None]
     outputs.check_apart(inputs, [path for path, _ in given.values()])
-    if args.png is not None and not outputs.can_draw():
-        raise ValueError('--png: pictures need matplotlib: pip install "cfr_jax[viz]"')
+    if args.png is not None:
+        outputs.check_library("--png", args.png)
 
 
 def _write_json(path: Path | None, document: dict) -> None:
@@ -183,15 +184,6 @@ def _write_json(path: Path | None, document: dict) -> None:
         sys.stdout.write(text)
     else:
         write_atomically(path, text.encode())
-
-
-def _write_pictures(args: argparse.Namespace, scene) -> None:
-    from cfr_jax import viewer
-
-    if args.view is not None:
-        viewer.write_page(args.view, scene)
-    if args.png is not None:
-        viewer.write_picture(args.png, scene)
 
 
 def _positive(text: str) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from cfr_jax import __version__
@@ -109,8 +110,9 @@ def as_text(result: Result) -> str:
     return "\n".join(lines)
 
 
-def quality(found: Alignment) -> dict[str, str]:
-    """The figures a reader judges by, written out."""
+def quality(found: Any) -> dict[str, str]:
+    """The figures a reader judges by, of an `Alignment` or of what has the same ones, written
+    out."""
     return {
         "confidence": f"{found.confidence:.2f}",
         "fitness": f"{found.fitness:.3f} of the source within {found.inlier_distance:.4g}",
@@ -122,18 +124,15 @@ def quality(found: Alignment) -> dict[str, str]:
 def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
     """The way from the start to the answer, with `facts` before the figures of quality."""
     found = result.alignment
-    start = np.eye(4) if result.initial is None else result.initial
-    stations = [start, *found.transforms]
-    labels = ["start", *(f"iteration {i}" for i in range(1, len(found.transforms) + 1))]
-    if found.refined:
-        stations.append(found.transform)
-        labels.append("refined")
+    stations, labels = way(
+        result.initial, found.transforms, found.transform if found.refined else None
+    )
     weights = np.full(len(result.source), np.nan)  # NaN: a point the network did not see
     weights[found.source_rows] = found.weights
     return Scene(
         source=result.source.points,
         target=result.target.points,
-        transforms=np.stack(stations),
+        transforms=stations,
         labels=labels,
         weights=weights,
         facts={**(facts or {}), **quality(found)},
@@ -141,6 +140,18 @@ def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
         target_name=result.target.name,
         warnings=found.warnings,
     )
+
+
+def way(
+    initial: ArrayLike | None, transforms: ArrayLike, refined: ArrayLike | None
+) -> tuple[list[ArrayLike], list[str]]:
+    """The stations of the motion, each (4, 4), and what they are called."""
+    stations = [np.eye(4) if initial is None else initial, *transforms]
+    labels = ["start", *(f"iteration {i}" for i in range(1, len(stations)))]
+    if refined is not None:
+        stations.append(refined)
+        labels.append("refined")
+    return stations, labels
 
 
 def _cloud(cloud: PointCloud, path: str, used: int) -> dict[str, Any]:

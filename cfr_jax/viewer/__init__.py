@@ -1,7 +1,8 @@
-"""Pictures of a registration: one HTML page to turn it in, one PNG to print."""
+"""Pictures of a registration: an HTML page to turn it in, a PNG to print, a Rerun recording."""
 
 from cfr_jax.viewer.page import write_page
 from cfr_jax.viewer.picture import write_picture
+from cfr_jax.viewer.recording import write_recording
 from cfr_jax.viewer.scene import Scene
 
-__all__ = ["Scene", "write_page", "write_picture"]
+__all__ = ["Scene", "write_page", "write_picture", "write_recording"]

@@ -1,0 +1,61 @@
+"""The registration as a recording for the Rerun viewer: the motion on a time line of its own."""
+
+import os
+
+import numpy as np
+
+from cfr_jax.viewer.atomic import unfinished
+from cfr_jax.viewer.picture import SOURCE, TARGET
+from cfr_jax.viewer.scene import Scene
+from cfr_jax.viewer.view import best_view
+
+PIXELS = 2.5  # diameter of a point
+
+
+def write_recording(path: str | os.PathLike[str], scene: Scene) -> None:
+    """Writes `scene` as an `.rrd` file, for `rerun FILE`, replacing what was there.
+
+    Entities: `target`, `source` (a transform for each station of the time line "station"),
+    `source/points`, and the texts `result` and `station`. Rerun computes in float32, so that
+    positions are given from the middle of the aligned clouds; `result` says where that is.
+
+    Raises ModuleNotFoundError without rerun (the `rerun` extra), OSError if `path` cannot be
+    written.
+    """
+    try:
+        import rerun as rr
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            'recordings need rerun: pip install "cfr_jax[rerun]"', name="rerun"
+        ) from error
+
+    def points(positions, color):
+        return rr.Points3D(
+            positions.astype(np.float32),
+            colors=np.rint(255 * color).astype(np.uint8),
+            radii=rr.Radius.ui_points(PIXELS / 2),
+        )
+
+    center, middle = best_view(scene).center, scene.source.mean(axis=0)
+    with unfinished(path) as beside:
+        stream = rr.RecordingStream("cfr_jax")
+        stream.save(beside)
+        stream.log("result", rr.TextDocument(_text(scene, center)), static=True)
+        stream.log("target", points(scene.target - center, TARGET), static=True)
+        stream.log("source/points", points(scene.source - middle, SOURCE), static=True)
+        for k, (label, transform) in enumerate(zip(scene.labels, scene.transforms, strict=True)):
+            # of the source's middle, and without the offset: a difference taken in float64
+            position = transform[:3, :3] @ middle + transform[:3, 3] - center
+            stream.set_time("station", sequence=k)
+            stream.log("station", rr.TextDocument(label))
+            stream.log("source", rr.Transform3D(mat3x3=transform[:3, :3], translation=position))
+        stream.flush()
+        stream.disconnect()
+
+
+def _text(scene, center):
+    lines = [f"source: {scene.source_name}", f"target: {scene.target_name}"]
+    lines += [f"{name}: {text}" for name, text in scene.facts.items()]
+    lines += [f"warning: {text}" for text in scene.warnings]
+    lines.append(f"positions are given from {center.tolist()} in the target's frame")
+    return "\n".join(lines).encode("utf-8", "replace").decode("utf-8")
