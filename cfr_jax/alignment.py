@@ -60,6 +60,25 @@ class Alignment:
         """Whether the motion is determined and more likely right than wrong."""
         return self.determined and self.confidence >= doubts.TRUSTED
 
+    def to_open3d(self) -> Any:
+        """The answer as an `open3d.pipelines.registration.RegistrationResult`.
+
+        `transformation`, `fitness` and `inlier_rmse` mean in Open3D what they mean here:
+        `source.transform(result.to_open3d().transformation)` lays the source on the target. The
+        correspondences are soft here, so that `correspondence_set` stays empty. Raises
+        ModuleNotFoundError without Open3D.
+        """
+        try:
+            from open3d.pipelines.registration import RegistrationResult
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(
+                'to_open3d needs Open3D: pip install "cfr_jax[baselines]"', name="open3d"
+            ) from error
+        result = RegistrationResult()
+        result.transformation = self.transform
+        result.fitness, result.inlier_rmse = self.fitness, self.inlier_rmse
+        return result
+
 
 def align(
     source: Any,
@@ -73,7 +92,7 @@ def align(
 ) -> Alignment:
     """Finds the rigid motion that lays `source` on `target`.
 
-    Clouds are (n, 3) arrays, (n, 6) with normals, paths, or Open3D and trimesh objects. They are
+    Clouds are (n, 3) arrays, (n, 6) with normals, paths, or whatever `io.as_point_cloud` takes. They are
     centered and scaled in float64, thinned to `max_points` each (default 1,024; `seed` says which),
     given normals where they have none, registered by the network with `params` (default: the
     weights that ship) and refined (`refinement.refine`; off with `refine=False`).

@@ -1,6 +1,7 @@
 """Whatever holds points, as a `PointCloud`.
 
-Open3D and trimesh are told by the module of the object's class, so that neither is imported here.
+Other libraries' objects are told by the module of their class, and ROS messages by their members, so
+that none of them is imported here.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .cloud import CloudFileError, PointCloud, usable_normals
+from .columns import from_data_frame, from_point_cloud2, from_structured, is_point_cloud2
 from .files import read
 from .mesh import Mesh
 
@@ -20,15 +22,18 @@ def as_point_cloud(obj: Any, *, name: str, samples: int | None = None, seed: int
 
     Args:
         obj: an array (n, 3), or (n, 6) with normals of any length in the last three columns, of
-            floats or integers: from numpy, jax, torch (on the CPU), or nested lists; an Open3D
-            point cloud or triangle mesh (legacy or tensor); a trimesh PointCloud, Trimesh or
-            Scene; a path, which is read; or a PointCloud.
+            floats or integers: from numpy, jax, torch (on any device, with or without gradients),
+            whatever speaks DLPack or the array protocol, or nested lists; a structured array with
+            the fields x, y, z, and perhaps normal_x … or nx …; a pandas or polars frame with such
+            columns, or with 3 or 6 of them; a ROS PointCloud2 message, whose cells without a point
+            (NaN) are left out; an Open3D point cloud or triangle mesh (legacy or tensor); a
+            trimesh PointCloud, Trimesh or Scene; a path, which is read; or a PointCloud.
         name: what the caller calls this argument; it opens every error message, and names the
             cloud unless a file does.
         samples: as for `read`: points drawn from a mesh, 10,000 if None, 0 for its vertices.
         seed: of that sampling.
 
-    The points may share memory with `obj`.
+    Nothing is copied that need not be: float64 rows in host memory share it with `obj`.
 
     Raises:
         ValueError: `obj` holds no point cloud; says what came and what was wanted.
@@ -42,7 +47,12 @@ def as_point_cloud(obj: Any, *, name: str, samples: int | None = None, seed: int
         shape = _from_library(obj, name)
         if isinstance(shape, Mesh):
             return shape.points(samples, seed)
-        return shape if shape is not None else _from_array(_as_array(obj), name)
+        if shape is not None:
+            return shape
+        array = _as_array(obj)
+        if array.dtype.names:
+            return from_structured(array, name)
+        return _from_array(array, name)
     except CloudFileError as error:
         raise CloudFileError(f"{name}: {error}") from None
     except ValueError as error:
@@ -50,7 +60,7 @@ def as_point_cloud(obj: Any, *, name: str, samples: int | None = None, seed: int
 
 
 def _from_library(obj: Any, name: str) -> PointCloud | Mesh | None:
-    """A cloud or mesh of Open3D or trimesh; None for everything else."""
+    """A cloud or mesh of a library, a frame, a ROS message; None for everything else."""
     # Derived classes live in the user's module; the library's own is then among the bases.
     for kind in type(obj).__mro__:
         match kind.__module__.partition(".")[0], kind.__name__:
@@ -64,7 +74,19 @@ def _from_library(obj: Any, name: str) -> PointCloud | Mesh | None:
                 return _from_library(obj.to_mesh(), name)
             case "trimesh", "Trimesh":
                 return Mesh(_numbers(obj.vertices), _numbers(obj.faces).astype(np.int64), name)
-    return None
+            case "torch", "Tensor":
+                return _from_array(_checked(obj, _from_torch(obj)), name)
+            case "pandas" | "polars", "DataFrame":
+                return from_data_frame(obj, name)
+    return from_point_cloud2(obj, name) if is_point_cloud2(obj) else None
+
+
+def _from_torch(tensor: Any) -> np.ndarray:
+    try:
+        tensor = tensor.detach().cpu()
+        return (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()
+    except (TypeError, RuntimeError) as error:  # sparse, quantized
+        raise ValueError(f"got a tensor which is no array ({error}); {_WANTED}") from None
 
 
 def _from_open3d(cloud: Any, name: str) -> PointCloud:
@@ -94,16 +116,25 @@ def _numbers(values: Any) -> np.ndarray:
     return np.asarray(values).view(np.ndarray)  # trimesh hands out arrays that track changes
 
 
+_WANTED = (
+    "wanted an (n, 3) or (n, 6) array, a path, or a cloud of Open3D, trimesh, torch, pandas or ROS"
+)
+
+
 def _as_array(obj: Any) -> np.ndarray:
-    wanted = "wanted an (n, 3) or (n, 6) array, a path, or a cloud of Open3D or trimesh"
     try:
         if not hasattr(obj, "__array__") and hasattr(obj, "__dlpack__"):
-            return np.from_dlpack(obj)
-        array = np.asarray(obj)
+            array = np.from_dlpack(obj)
+        else:
+            array = np.asarray(obj)
     except Exception as error:  # arrays on a device or with gradients refuse in ways of their own
-        raise ValueError(f"got {_kind(obj)}, which is no array ({error}); {wanted}") from None
+        raise ValueError(f"got {_kind(obj)}, which is no array ({error}); {_WANTED}") from None
+    return array if array.dtype.names else _checked(obj, array)
+
+
+def _checked(obj: Any, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in "fiu":
-        raise ValueError(f"got {_kind(obj)} of {array.dtype}; {wanted} of floats or integers")
+        raise ValueError(f"got {_kind(obj)} of {array.dtype}; {_WANTED} of floats or integers")
     return array
 
 

@@ -1,0 +1,111 @@
+"""Clouds whose columns have names: ROS messages, structured arrays, data frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from .cloud import PointCloud, usable_normals
+
+# sensor_msgs/PointField: the numbers of the types.
+_ROS_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_POINT = ("x", "y", "z")
+_NORMALS = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
+
+
+def is_point_cloud2(obj: Any) -> bool:
+    """Whether `obj` has the members of a ROS sensor_msgs/PointCloud2, of ROS 1 or 2."""
+    members = ("fields", "point_step", "row_step", "width", "height", "data", "is_bigendian")
+    return all(hasattr(obj, member) for member in members)
+
+
+def from_point_cloud2(message: Any, name: str) -> PointCloud:
+    """The points of a message, with normal_x, normal_y, normal_z if it has them.
+
+    Cells without a point, which drivers mark by NaN, are left out and counted in `dropped`. Raises
+    ValueError for fields or sizes that do not fit the data.
+    """
+    order = ">" if message.is_bigendian else "<"
+    names, formats, offsets = [], [], []
+    for field in message.fields:
+        if field.name in _POINT or field.name in sum(_NORMALS, ()):
+            if field.datatype not in _ROS_TYPES or field.count not in (0, 1):
+                raise ValueError(
+                    f"field {field.name!r} has the type {field.datatype} and the count "
+                    f"{field.count}, wanted one number"
+                )
+            names.append(field.name)
+            formats.append(order + _ROS_TYPES[field.datatype])
+            offsets.append(field.offset)
+    width, height, step = (int(message.width), int(message.height), int(message.point_step))
+    row_step = int(message.row_step) or width * step
+    data = message.data
+    if not isinstance(data, (bytes, bytearray, memoryview, np.ndarray)):
+        data = bytes(data)  # a list of numbers
+    octets = np.frombuffer(data, np.uint8)
+    if row_step < width * step or len(octets) < height * row_step:
+        raise ValueError(
+            f"{len(octets)} bytes do not hold {height} rows of {width} points of {step} bytes"
+        )
+    try:
+        layout = np.dtype(
+            {"names": names, "formats": formats, "offsets": offsets, "itemsize": step}
+        )
+    except ValueError as error:
+        raise ValueError(f"fields do not fit into a point_step of {step}: {error}") from None
+    rows = octets[: height * row_step].reshape(height, row_step)[:, : width * step]
+    return from_structured(np.ascontiguousarray(rows).view(layout), name)
+
+
+def from_structured(array: np.ndarray, name: str) -> PointCloud:
+    """Fields x, y, z of a structured array of any shape, and normals if they are there.
+
+    Rows with a NaN in x, y or z carry no point, as ROS marks them: they are left out and counted
+    in `dropped`.
+    """
+    flat = array.reshape(-1)
+    points, normals = _columns(array.dtype.names, lambda column: flat[column])
+    filled = ~np.isnan(points).any(axis=1)
+    dropped = len(points) - int(np.count_nonzero(filled))
+    if dropped and dropped == len(points):
+        raise ValueError(f"all {dropped} points are NaN, wanted at least one that is not")
+    if dropped:
+        points, normals = points[filled], None if normals is None else normals[filled]
+    return PointCloud(
+        points, None if normals is None else usable_normals(normals), name, dropped=dropped
+    )
+
+
+def from_data_frame(frame: Any, name: str) -> PointCloud | None:
+    """Columns x, y, z (in any case) of a pandas or polars frame, and normals if they are there;
+    None for a frame without such columns."""
+    names = {str(column).lower(): column for column in frame.columns}
+    if not set(_POINT) <= names.keys():
+        return None
+    points, normals = _columns(names, lambda column: _numbers(frame[names[column]].to_numpy()))
+    return PointCloud(points, None if normals is None else usable_normals(normals), name)
+
+
+def _columns(names: Iterable[str] | None, column: Callable[[str], np.ndarray]):
+    """Points (n, 3), and normals (n, 3) or None, from the columns of these names."""
+    names = set(names or ())
+    missing = [axis for axis in _POINT if axis not in names]
+    if missing:
+        raise ValueError(
+            f"has no {' and no '.join(missing)} among {', '.join(sorted(names)) or 'no columns'}"
+        )
+    normals = next((triple for triple in _NORMALS if set(triple) <= names), None)
+    return tuple(
+        None
+        if triple is None
+        else np.stack([np.asarray(column(axis), np.float64) for axis in triple], axis=1)
+        for triple in (_POINT, normals)
+    )
+
+
+def _numbers(values: np.ndarray) -> np.ndarray:
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"a column is of {values.dtype}, wanted floats or integers")
+    return values
