@@ -22,6 +22,7 @@ _WORD = 32
 # 25 to 31 at 2,048), a block of rows at a time.
 _FEW = 1536
 _HOST_ROWS = 64
+_TREE_ROWS = 1 << 13
 
 
 def nearest(
@@ -223,20 +224,21 @@ def _among_all(points, k):
 
 
 def _in_tree(points, k, workers):
-    """The same by a KD-tree."""
+    """The same by a KD-tree, some rows at a time: what it finds is many times what is kept."""
     n = len(points)
     tree = cKDTree(points)
-    keys, rows = np.empty((n, k), np.int64), np.arange(n)
-    for more in (8, 256):  # on a lattice the few are not enough
-        wide = min(n, k + more)
-        near = tree.query(points[rows], wide, workers=workers)[1].reshape(len(rows), wide)
-        offset = points[near] - points[rows, None]
-        square = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
-        farthest = square.max(axis=1)
-        square[near == rows[:, None]] = np.inf
-        keys[rows] = _smallest(square, near, k)
-        last = _square_of(keys[rows]).max(axis=1)
-        rows = rows[last == farthest] if wide < n else rows[:0]
+    keys = np.empty((n, k), np.int64)
+    for rows in np.array_split(np.arange(n), -(-n // _TREE_ROWS)):
+        for more in (8, 256):  # on a lattice the few are not enough
+            wide = min(n, k + more)
+            near = tree.query(points[rows], wide, workers=workers)[1].reshape(len(rows), wide)
+            offset = points[near] - points[rows, None]
+            square = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
+            farthest = square.max(axis=1)
+            square[near == rows[:, None]] = np.inf
+            keys[rows] = _smallest(square, near, k)
+            last = _square_of(keys[rows]).max(axis=1)
+            rows = rows[last == farthest] if wide < n else rows[:0]
     return keys
 
 

@@ -4,7 +4,7 @@ Of n rows of 1,024 channels only one row per channel survives the maximum. The n
 follow from the mean and covariance of the narrow input, the norm and the ReLU are monotonic, so the
 maximum can be taken before them; and the gradient is one row per channel, plus what the norm takes
 out of it, which is linear in the input: a product as narrow as the input instead of one as wide as
-the output.
+the output. What is as wide as the output is made for a tile of rows at a time.
 """
 
 from __future__ import annotations
@@ -13,9 +13,12 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from cfr_jax.layers import Layer, norm_of, projections
+
+_TILE_ROWS = 1 << 14  # 64 MiB of 1,024 channels; clouds of the usual size are one tile
 
 
 def pooled_layer(
@@ -44,16 +47,43 @@ def _forward(layer, x, valid, groups):
     norm = norm_of(channel_mean, ((covariance @ layer.kernel) * layer.kernel).sum(0), groups)
     # for a negative scale the smallest value becomes the largest
     sign = jnp.where(layer.scale >= 0, 1, -1).astype(x.dtype)
-    z = x @ (layer.kernel * sign)
-    z = jnp.where(valid[:, None] > 0, z, -jnp.inf)
-    high = jnp.max(z, axis=0)
-    high = jnp.where(jnp.isfinite(high), high, 0)
+    high, chosen = _highest(x, layer.kernel * sign, valid)
     normal = (high * sign + layer.bias - norm.mean) * norm.rate
     pooled = jax.nn.relu(normal * layer.scale + layer.shift)
-    # two plain reductions: XLA's argmax on CPU is not vectorized
-    rows = jnp.arange(x.shape[0], dtype=jnp.int32)[:, None]
-    chosen = jnp.min(jnp.where(z >= high, rows, x.shape[0] - 1), axis=0)
     return pooled, (layer, x, valid, (mean, covariance, channel_mean), norm, normal, chosen)
+
+
+def _highest(x, kernel, valid):
+    """Per channel the largest value of x kernel over the valid rows, and the first row that has it;
+    0 and some row where none is valid."""
+    n = x.shape[0]
+
+    def of_tile(x, valid, start):
+        z = jnp.where(valid[:, None] > 0, x @ kernel, -jnp.inf)
+        high = jnp.max(z, axis=0)
+        # two plain reductions: XLA's argmax on CPU is not vectorized
+        rows = start + jnp.arange(x.shape[0], dtype=jnp.int32)[:, None]
+        return high, jnp.min(jnp.where(z >= high, rows, n - 1), axis=0)
+
+    if n <= _TILE_ROWS:
+        high, chosen = of_tile(x, valid, 0)
+    else:
+
+        def merge(best, tile):
+            high, chosen = of_tile(*tile)
+            higher = high > best[0]
+            return (jnp.where(higher, high, best[0]), jnp.where(higher, chosen, best[1])), None
+
+        count = -(-n // _TILE_ROWS)
+        more = count * _TILE_ROWS - n
+        tiles = (
+            jnp.pad(x, ((0, more), (0, 0))).reshape(count, _TILE_ROWS, -1),
+            jnp.pad(valid, (0, more)).reshape(count, _TILE_ROWS),
+            _TILE_ROWS * jnp.arange(count, dtype=jnp.int32),
+        )
+        lowest = jnp.full(kernel.shape[1], -jnp.inf, x.dtype), jnp.zeros(kernel.shape[1], jnp.int32)
+        (high, chosen), _ = lax.scan(merge, lowest, tiles)
+    return jnp.where(jnp.isfinite(high), high, 0), jnp.minimum(chosen, n - 1)
 
 
 def _backward(groups, residuals, gradient):

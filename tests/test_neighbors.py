@@ -31,6 +31,7 @@ CLOUDS = {
 def on_host(request, monkeypatch):
     """The host's search, for small clouds and for large ones."""
     monkeypatch.setattr(neighbors, "_FEW", 10**9 if request.param == "all pairs" else 0)
+    monkeypatch.setattr(neighbors, "_TREE_ROWS", 50)  # three chunks
     return nearest_on_host
 
 

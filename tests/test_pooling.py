@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cfr_jax import pooling
 from cfr_jax.layers import Layer, group_norm
 from cfr_jax.pooling import pooled_layer
 
@@ -24,8 +25,10 @@ def plain(layer, x):
     return jax.nn.relu(z).max(axis=0)
 
 
+@pytest.mark.parametrize("rows", [N, 5], ids=["one tile", "three tiles"])
 @pytest.mark.parametrize("mask", [None, MASK], ids=["all", "masked"])
-def test_values_and_gradients_are_those_of_the_plain_form(x64, mask):
+def test_values_and_gradients_are_those_of_the_plain_form(x64, monkeypatch, mask, rows):
+    monkeypatch.setattr(pooling, "_TILE_ROWS", rows)
     layer, x = given()
     valid = slice(None) if mask is None else mask
     pull = jnp.asarray(np.random.default_rng(1).normal(size=WIDTH))
@@ -58,3 +61,14 @@ def test_gradients_are_finite_whatever_comes_in(scale, valid):
     gradients = slope(layer, x * scale, jnp.arange(N) < valid)
 
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+
+
+def test_memory_for_the_wide_layer_does_not_grow_with_the_clouds():
+    def needed(n):
+        parts = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in [(4, 256)] + 3 * [(256,)]]
+        x = jax.ShapeDtypeStruct((n, 4), jnp.float32)
+        compiled = slope.lower(Layer(*parts), x, jax.ShapeDtypeStruct((n,), bool)).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    wide = 256 * 4
+    assert needed(200_000) < needed(20_000) + 180_000 * wide / 4
