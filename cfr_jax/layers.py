@@ -40,18 +40,19 @@ def group_norm(
     mask: Bool[Array, " n"] | None = None,
 ) -> Float[Array, "n c"]:
     """GroupNorm of one cloud; rows where `mask` is false enter no statistic."""
-    n, channels = x.shape
-    grouped = x.reshape(n, groups, channels // groups)
-    if mask is None:
-        where, count = None, jnp.asarray(n, x.dtype)
-    else:
-        where, count = mask[:, None, None], jnp.maximum(jnp.sum(mask), 1).astype(x.dtype)
-    count = count * (channels // groups)
-    mean = jnp.sum(grouped, axis=(0, 2), keepdims=True, where=where) / count
-    centered = grouped - mean
-    variance = jnp.sum(centered**2, axis=(0, 2), keepdims=True, where=where) / count
-    normal = centered * lax.rsqrt(variance + EPSILON)
-    return normal.reshape(n, channels) * scale + shift
+    # over the rows first, channel by channel, and then over the channels of a group: vectors as
+    # wide as x instead of as narrow as a group
+    size = x.shape[1] // groups
+    valid = None if mask is None else mask[:, None].astype(x.dtype)
+    count = jnp.asarray(x.shape[0], x.dtype) if mask is None else jnp.maximum(jnp.sum(valid), 1)
+
+    def mean_of_group(rows):
+        total = jnp.sum(rows if mask is None else rows * valid, axis=0)
+        return jnp.repeat(total.reshape(groups, size).mean(1) / count, size)
+
+    centered = x - mean_of_group(x)
+    variance = mean_of_group(centered * centered)
+    return centered * (lax.rsqrt(variance + EPSILON) * scale) + shift
 
 
 def apply_layer(
