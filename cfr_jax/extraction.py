@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from cfr_jax.batching import cloud_by_cloud
 from cfr_jax.layers import Layer, fold, norm_of, projections
 
 # Rows of 96 floats in flight, so that a tile's activations stay in a cache: two or three of them at
@@ -53,10 +54,23 @@ def pooled_features(
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
 def _pooled(layers, raw, valid, groups):
-    return _forward(layers, raw, valid, groups)[0]
+    return cloud_by_cloud(functools.partial(_forward, groups=groups))(layers, raw, valid)[0]
 
 
-def _forward(layers, raw, valid, groups):
+def _pooled_fwd(layers, raw, valid, groups):
+    forward = cloud_by_cloud(functools.partial(_forward, groups=groups))
+    pooled, norms, normal = forward(layers, raw, valid)
+    return pooled, (layers, raw, valid, norms, normal)
+
+
+def _pooled_bwd(groups, residuals, gradient):
+    return cloud_by_cloud(functools.partial(_backward, groups=groups))(residuals, gradient)
+
+
+_pooled.defvjp(_pooled_fwd, _pooled_bwd)
+
+
+def _forward(layers, raw, valid, *, groups):
     one, two, three = layers
     n, k, _ = raw.shape
     count = -(-n * k // _FORWARD_ROWS)
@@ -90,10 +104,10 @@ def _forward(layers, raw, valid, groups):
     extreme = high.reshape(-1, high.shape[-1])[:n] * sign + three.bias
     normal = (extreme - norm_three.mean) * norm_three.rate
     pooled = jax.nn.relu(normal * three.scale + three.shift)
-    return pooled, (layers, raw, valid, (norm_one, norm_two, norm_three), normal)
+    return pooled, (norm_one, norm_two, norm_three), normal
 
 
-def _backward(groups, residuals, gradient):
+def _backward(residuals, gradient, *, groups):
     layers, raw, valid, (norm_one, norm_two, norm_three), normal = residuals
     one, two, three = layers
     n, k, channels = raw.shape
@@ -183,9 +197,6 @@ def _backward(groups, residuals, gradient):
         Layer(kernel_three, bias_three, scale_three, shift_three),
     )
     return gradients, d_raw.reshape(raw.shape), jnp.zeros_like(valid)
-
-
-_pooled.defvjp(_forward, _backward)
 
 
 def _cut(values, count):

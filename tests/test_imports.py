@@ -15,7 +15,7 @@ PACKAGE = ROOT / "cfr_jax"
 # A file knows what stands on the lines above its own, and the files of its own folder. A new file
 # is put in here first.
 LAYERS = (
-    ("eigen",),
+    ("eigen", "batching"),
     ("layers",),
     ("rigid", "neighbors", "normals", "features", "sinkhorn", "extraction", "pooling"),
     ("network",),
