@@ -60,8 +60,10 @@ def nearest(
     return _by_rows(points, choose)
 
 
-def first_in_ball(points: Float[Array, "n 3"], k: int, radius: float) -> Int32[Array, "n k"]:
-    """The first `k` other points, by index, within `radius` of each; what is missing, itself.
+def first_in_ball(
+    points: Float[Array, "n 3"], k: int, radius: float, mask: Bool[Array, " n"] | None = None
+) -> Int32[Array, "n k"]:
+    """The first `k` other valid points, by index, within `radius` of each; what is missing, itself.
 
     RPM-Net's neighborhoods: not the nearest, and with repeated centers where a ball is sparse. A
     rigid motion does not change them.
@@ -69,6 +71,8 @@ def first_in_ball(points: Float[Array, "n 3"], k: int, radius: float) -> Int32[A
 
     def choose(row, square):
         inside = (square <= radius * radius) & (row != jnp.arange(points.shape[0]))
+        if mask is not None:
+            inside &= mask
         rank = jnp.arange(k, dtype=jnp.int32)[None, :]
         found = _nth_set_bit(_pack(inside), jnp.broadcast_to(rank, (len(row), k)))
         return jnp.where(rank < jnp.sum(inside, axis=1, keepdims=True), found, row)

@@ -56,16 +56,18 @@ class PointFeatures(nn.Module):
 
 
 class Cascade(nn.Module):
-    """The light layers (QMLP), one per iteration, each with parameters of its own.
+    """The light layers (QMLP), one per iteration, each with parameters of its own, or one `shared`
+    by all of them.
 
     Layer i turns the features that layer i - 1 left, and where the points are now, into features to
     match: f <- normalize(A relu(groupnorm(f + B x)) + a).
     """
 
     iterations: int
+    shared: bool = False
 
     def setup(self):
-        count, d = self.iterations, CHANNELS
+        count, d = 1 if self.shared else self.iterations, CHANNELS
         self.position = self.param("position", _stacked_init, (count, 3, d))
         self.scale = self.param("scale", nn.initializers.ones, (count, d))
         self.shift = self.param("shift", nn.initializers.zeros, (count, d))
@@ -80,6 +82,7 @@ class Cascade(nn.Module):
         mask: Bool[Array, " n"] | None = None,
     ) -> Float[Array, "n d"]:
         """Layer `i` (from 0) alone; unit rows."""
+        i = 0 if self.shared else i
         moved = features + points @ self.position[i]
         hidden = nn.relu(group_norm(moved, self.scale[i], self.shift[i], groups=GROUPS, mask=mask))
         return unit_rows(hidden @ self.kernel[i] + self.bias[i])
@@ -157,10 +160,11 @@ class CFR(nn.Module):
     """Cascading feature extraction: the three learned parts under one roof."""
 
     iterations: int = 5
+    shared: bool = False
 
     def setup(self):
         self.features = PointFeatures()
-        self.cascade = Cascade(self.iterations)
+        self.cascade = Cascade(self.iterations, self.shared)
         self.annealing = AnnealingNet(self.iterations)
 
     def __call__(self, raw, source, target):
@@ -186,7 +190,7 @@ def _join_masks(source, target, source_mask, target_mask):
     return jnp.concatenate(masks)
 
 
-def init_params(key: jax.Array, iterations: int = 5) -> dict:
-    """Fresh parameters, a pytree of float32 arrays."""
+def init_params(key: jax.Array, iterations: int = 5, shared: bool = False) -> dict:
+    """Fresh parameters, a pytree of float32 arrays; `shared`: one light layer for all of them."""
     points, raw = jnp.zeros((2, 3)), jnp.zeros((2, 1, RAW_CHANNELS))
-    return CFR(iterations).init(key, raw, points, points)["params"]
+    return CFR(iterations, shared).init(key, raw, points, points)["params"]

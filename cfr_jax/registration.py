@@ -40,6 +40,15 @@ class Settings:
     anew whenever it needs them, "auto" streams what is large. "log space" is RPM-Net's."""
     detach_motion: bool = False
     """Stop gradients at the motion between iterations, as the paper trains."""
+    # What the paper leaves out of RPM-Net, to measure what that saves. Weights answer best with
+    # what they were trained with.
+    passes: int | None = None
+    """Sinkhorn passes of every iteration; None: i passes in iteration i."""
+    repeat_annealing: bool = False
+    """Predict the annealing in every iteration, from where the source is by then."""
+    repeat_extraction: bool = False
+    """Extract the heavy features in every iteration, from the source as it is turned by then,
+    instead of handing on those of the iteration before."""
 
 
 @struct.dataclass
@@ -131,10 +140,12 @@ def encode(
 def _encode(params, target, *, settings):
     cloud = _prepared("target", target, settings)
     network = bind(params)
-    features = network.cascade.at_rest(
-        _heavy_features(network, cloud, settings), cloud.points, cloud.mask
-    )
-    return Encoded(cloud, features)
+    heavy = _heavy_features(network, cloud, settings)
+    if settings.repeat_extraction:
+        layers = range(iterations_of(params))
+        every = [network.cascade.layer(i, heavy, cloud.points, cloud.mask) for i in layers]
+        return Encoded(cloud, jnp.stack(every))
+    return Encoded(cloud, network.cascade.at_rest(heavy, cloud.points, cloud.mask))
 
 
 def register(
@@ -199,18 +210,25 @@ def iterate(
     reference = target.cloud
     annealing = network.annealing(source.points, reference.points, source.mask, reference.mask)
     received = features = _heavy_features(network, source, settings)
-    moved = source.points
+    moved = source
     for i in range(iterations):
         layer = min(i, count - 1)
-        received = features if i == layer else received
-        features = network.cascade.layer(layer, received, moved, source.mask)
+        if i and settings.repeat_annealing:
+            annealing = network.annealing(
+                moved.points, reference.points, source.mask, reference.mask
+            )
+        if i and settings.repeat_extraction:
+            received = _heavy_features(network, moved, settings)
+        elif i == layer:
+            received = features
+        features = network.cascade.layer(layer, received, moved.points, source.mask)
         affinity = Affinity(
             features, target.features[layer], annealing.beta[layer], annealing.alpha[layer]
         )
         found = match(
             affinity,
             reference.points,
-            passes=layer + 1,
+            passes=layer + 1 if settings.passes is None else settings.passes,
             form=settings.match,
             source_mask=source.mask,
             target_mask=reference.mask,
@@ -218,7 +236,9 @@ def iterate(
         transform = rigid.fit_rigid(source.points, found.targets, found.weights)
         yield Step(transform, found, affinity)
         motion = lax.stop_gradient(transform) if settings.detach_motion else transform
-        moved = rigid.apply(motion, source.points)
+        moved = source.replace(
+            points=rigid.apply(motion, source.points), normals=rigid.rotate(motion, source.normals)
+        )
 
 
 def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> Iterator[Step]:
@@ -229,12 +249,13 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> It
 
 def iterations_of(params: dict) -> int:
     """L, the number of iterations that the parameters were made for."""
-    return params["cascade"]["kernel"].shape[0]
+    return params["annealing"]["out"]["bias"].shape[0] // 2
 
 
 def bind(params: dict) -> CFR:
     """The network with its parameters inside."""
-    return CFR(iterations_of(params)).bind({"params": params})
+    shared = params["cascade"]["kernel"].shape[0] == 1
+    return CFR(iterations_of(params), shared).bind({"params": params})
 
 
 def _prepared(name, cloud, settings):

@@ -14,7 +14,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int32
 
 from cfr_jax import rigid
 from cfr_jax.extraction import pooled_features
@@ -45,15 +45,17 @@ class Features(nn.Module):
     """MLP on every neighbor, maximum, MLP on every point; unit rows."""
 
     @nn.compact
-    def __call__(self, raw: Float[Array, "n k 10"]) -> Float[Array, "n 96"]:
+    def __call__(
+        self, raw: Float[Array, "n k 10"], mask: Bool[Array, " n"] | None = None
+    ) -> Float[Array, "n 96"]:
         layers, width = [], raw.shape[-1]
         for i, wider in enumerate(_WIDTHS):
             layers.append(layer_of(self, f"neighbor_{i}", width, wider))
             width = wider
-        x = pooled_features(tuple(layers), raw, groups=GROUPS)
+        x = pooled_features(tuple(layers), raw, groups=GROUPS, mask=mask)
         for i, wider in enumerate((192, _CHANNELS)):
             layer = layer_of(self, f"point_{i}", x.shape[-1], wider)
-            x = nn.relu(apply_layer(layer, x, groups=GROUPS))
+            x = nn.relu(apply_layer(layer, x, groups=GROUPS, mask=mask))
         return unit_rows(nn.Dense(_CHANNELS, kernel_init=kernel_init, name="out")(x))
 
 
@@ -76,31 +78,51 @@ def init_params(key: jax.Array) -> dict:
 
 
 def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> Iterator[Step]:
-    """The iterations, one by one; clouds without masks, their `neighbors` are not used.
+    """The iterations, one by one; the clouds' `neighbors` are not used.
 
     As published, no gradient flows through the motion between two iterations.
     """
-    network = RPMNet().bind({"params": params})
+    network = bind(params)
     form = "auto" if settings.optimized else "log space"
-    moved, normals = source.points, source.normals
-    balls = None
+    moved, balls = source, None
     for _ in range(settings.iterations):
         if balls is None or not settings.optimized:
-            balls = [
-                first_in_ball(lax.stop_gradient(points), settings.neighbors, settings.radius)
-                for points in (moved, target.points)
-            ]
-        annealing = network.annealing(moved, target.points)
+            balls = [find_neighbors(cloud, settings) for cloud in (moved, target)]
+        annealing = network.annealing(moved.points, target.points, source.mask, target.mask)
         features = [
-            network.features(raw_features(*cloud, ball, ppf="angle", position=True))
-            for cloud, ball in zip(
-                ((moved, normals), (target.points, target.normals)), balls, strict=True
-            )
+            extract(network, cloud, ball)
+            for cloud, ball in zip((moved, target), balls, strict=True)
         ]
         affinity = Affinity(*features, annealing.beta[0], annealing.alpha[0])
-        found = match(affinity, target.points, passes=settings.passes, form=form)
+        found = match(
+            affinity,
+            target.points,
+            passes=settings.passes,
+            form=form,
+            source_mask=source.mask,
+            target_mask=target.mask,
+        )
         transform = rigid.fit_rigid(source.points, found.targets, found.weights)
         yield Step(transform, found, affinity)
         motion = lax.stop_gradient(transform)
-        moved = rigid.apply(motion, source.points)
-        normals = rigid.rotate(motion, source.normals)
+        moved = source.replace(
+            points=rigid.apply(motion, source.points), normals=rigid.rotate(motion, source.normals)
+        )
+
+
+def bind(params: dict) -> RPMNet:
+    """The network with its parameters inside."""
+    return RPMNet().bind({"params": params})
+
+
+def find_neighbors(cloud: Cloud, settings: Settings) -> Int32[Array, "n k"]:
+    """The neighborhoods of a cloud where it is now."""
+    return first_in_ball(
+        lax.stop_gradient(cloud.points), settings.neighbors, settings.radius, cloud.mask
+    )
+
+
+def extract(network: RPMNet, cloud: Cloud, neighbors: Int32[Array, "n k"]) -> Float[Array, "n 96"]:
+    """The features of a cloud where it is now; unit rows."""
+    raw = raw_features(cloud.points, cloud.normals, neighbors, ppf="angle", position=True)
+    return network.features(raw, cloud.mask)

@@ -83,7 +83,7 @@ def run(config: ml_collections.ConfigDict, workdir: Path) -> dict:
     )
     params = chosen.fresh(jax.random.key(config.seed))
     if config.train.start_from:
-        params = weights.load_params(config.train.start_from)
+        params = weights.load_params(config.train.start_from, config.network)
     state = training.init_state(params, optimizer)
     best: dict = {}
     with Checkpoints(workdir / "checkpoints", keep=config.keep_checkpoints) as checkpoints:

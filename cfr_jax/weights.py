@@ -16,10 +16,16 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from cfr_jax.network import init_params
+from cfr_jax import network as cfr_network
+from cfr_jax import rpmnet
 
 SHIPPED = Path(__file__).parent / "models"
 DEFAULT = "object"
+NETWORKS = {"cfr": "CFR", "rpmnet": "RPM-Net"}
+
+
+class NoWeights(ValueError):
+    """There is no such file, and nothing that ships has that name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +34,8 @@ class Weights:
 
     params: dict
     name: str
+    network: str
+    """One of `NETWORKS`; read off the names of the tensors."""
     sha256: str
     """Over the tensors and the notes, as written into the file when it was made."""
     notes: dict[str, str]
@@ -45,12 +53,13 @@ def save_params(path: str | Path, params: dict, notes: dict[str, str] | None = N
         beside.unlink(missing_ok=True)
 
 
-def load_params(source: str | Path = DEFAULT) -> dict:
+def load_params(source: str | Path = DEFAULT, network: str = "cfr") -> dict:
     """Parameters that ship with the package, by name, or of a .safetensors file, by path.
 
-    A pytree of float32 arrays for `register`. Raises ValueError as `read_weights` does.
+    A pytree of float32 arrays for `register`, or for `rpmnet.unroll` with `network="rpmnet"`.
+    Raises ValueError as `read_weights` does.
     """
-    return read_weights(source).params
+    return read_weights(source, network).params
 
 
 def shipped() -> tuple[str, ...]:
@@ -58,17 +67,22 @@ def shipped() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
 
 
-def read_weights(source: str | Path = DEFAULT) -> Weights:
-    """Weights with their name, digest and notes.
+def network_of(params: dict) -> str:
+    """Which of `NETWORKS` these parameters are made for, by their names."""
+    return _network_of(flatten_dict(params, sep="/"))
 
-    Raises ValueError where there is no such name or file, where the file is not sound (its digest
-    does not fit), and where it does not hold this network.
+
+def read_weights(source: str | Path = DEFAULT, network: str | None = None) -> Weights:
+    """Weights with their network, name, digest and notes.
+
+    Raises `NoWeights` where there is no such name or file, and ValueError where the file is not
+    sound (its digest does not fit) or holds another network than `network` (None: takes either).
     """
     path = Path(source)
     if str(source) in shipped():
         path = SHIPPED / f"{source}.safetensors"
     if not path.is_file():
-        raise ValueError(
+        raise NoWeights(
             f"weights: no file and no shipped weights called {str(source)!r}; "
             f"shipped are {', '.join(shipped()) or 'none'}"
         )
@@ -86,23 +100,37 @@ def read_weights(source: str | Path = DEFAULT) -> Weights:
         )
     if told != _digest(tensors, notes):
         raise ValueError(f"weights: {path} is damaged: its digest does not fit its content")
-    _check_shapes(path, tensors)
+    kind = _network_of(tensors)
+    _check_shapes(path, tensors, kind)
+    if network not in (None, kind):
+        raise ValueError(
+            f"weights: {path} holds the network {NETWORKS[kind]}, wanted {NETWORKS[network]}"
+        )
     params = unflatten_dict({name: jnp.asarray(leaf) for name, leaf in tensors.items()}, sep="/")
-    return Weights(params, path.stem, told, notes)
+    return Weights(params, path.stem, kind, told, notes)
 
 
-def _check_shapes(path, tensors):
-    stacked = tensors.get("cascade/kernel", np.zeros(0))
-    iterations = stacked.shape[0] if stacked.ndim == 3 else 5
-    wanted = jax.eval_shape(
-        functools.partial(init_params, iterations=iterations), jax.random.key(0)
-    )
+def _network_of(tensors):
+    return "rpmnet" if any(n.startswith("features/neighbor_") for n in tensors) else "cfr"
+
+
+def _check_shapes(path, tensors, kind):
+    fresh = rpmnet.init_params
+    if kind == "cfr":
+        stacked = tensors.get("cascade/kernel", np.zeros(0))
+        annealing = tensors.get("annealing/out/bias", np.zeros(10))
+        fresh = functools.partial(
+            cfr_network.init_params,
+            iterations=max(1, annealing.size // 2),
+            shared=stacked.shape[:1] == (1,),
+        )
+    wanted = jax.eval_shape(fresh, jax.random.key(0))
     wanted = {name: leaf.shape for name, leaf in flatten_dict(wanted, sep="/").items()}
     found = {name: leaf.shape for name, leaf in tensors.items()}
     for name in sorted(wanted.keys() | found.keys()):
         if wanted.get(name) != found.get(name):
             raise ValueError(
-                f"weights: {path} does not hold a CFR network: {name} is "
+                f"weights: {path} does not hold {NETWORKS[kind]}: {name} is "
                 f"{found.get(name, 'missing')}, wanted {wanted.get(name, 'no such tensor')}"
             )
         if tensors[name].dtype != np.float32:

@@ -14,6 +14,7 @@ def get_config() -> ConfigDict:
     config.limit = 300  # pairs; 0 for all
     config.seed = 0
     config.weights = "object"
+    config.rpmnet_weights = "rpmnet"  # by name or path; RPM-Net is left out where there are none
     config.threads = 2
     config.timeout = 60.0  # seconds a pair
     config.unit = ""  # the unit sphere
@@ -71,18 +72,27 @@ def methods() -> dict:
             "use": "kiss_matcher",
             "options": {"voxel": 0.1, "thin": False, "normal_gain": 2.0, "feature_gain": 4.0},
         },
-        "cfr": {"use": "cfr", "options": {"refine": False}, "batch": 8},
-        "cfr_refined": {"use": "cfr", "options": {"refine": True}, "batch": 8},
-        "cfr_estimated": {
-            "use": "cfr",
-            "options": {"refine": False},
-            "batch": 8,
-            "estimated_normals": True,
-        },
-        "cfr_estimated_refined": {
-            "use": "cfr",
-            "options": {"refine": True},
-            "batch": 8,
-            "estimated_normals": True,
-        },
+        "cfr": network("cfr") | {"modules": True},
+        "cfr_refined": network("cfr", refine=True),
+        "cfr_estimated": network("cfr", estimated=True),
+        "cfr_estimated_refined": network("cfr", refine=True, estimated=True),
+        # as published; with the paper's speed-ups, which the others have, it answers the same
+        "rpmnet": network("rpmnet", settings={"optimized": False}) | {"modules": True},
+        "rpmnet_optim": network("rpmnet") | {"modules": True},
+        "rpmnet_optim_refined": network("rpmnet", refine=True),
+        "rpmnet_optim_estimated": network("rpmnet", estimated=True),
+        "rpmnet_optim_estimated_refined": network("rpmnet", refine=True, estimated=True),
+        # trained as long as RPM-Net was (configs/two_hours.py); left out where the file is not
+        "cfr_two_hours": network("cfr") | {"weights": "cfr_two_hours"},
+        "cfr_two_hours_estimated": network("cfr", estimated=True) | {"weights": "cfr_two_hours"},
+    }
+
+
+def network(use: str, *, refine: bool = False, estimated: bool = False, **options) -> dict:
+    """A network on 8 pairs a call."""
+    return {
+        "use": use,
+        "options": {"refine": refine} | options,
+        "batch": 8,
+        "estimated_normals": estimated,
     }

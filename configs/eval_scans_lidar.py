@@ -20,6 +20,7 @@ def get_config() -> ConfigDict:
     config.limit = 60
     config.seed = 0
     config.weights = "object"
+    config.rpmnet_weights = "rpmnet"  # by name or path; RPM-Net is left out where there are none
     config.threads = 2
     config.timeout = 120.0  # seconds a pair
     config.unit = "m"
@@ -34,6 +35,7 @@ def methods() -> dict:
     """For scans thinned to 0.3 m, whose normals come from 3 m around, as published."""
     local = {"distances": (4.0, 2.0, 1.0), "start": "centroid"}
     features = {"normal_radius": 3.0, "feature_radius": 5.0, "voxel": 0.3}
+    prepared = {"through": "preparation", "max_points": 4000}
     network = {"through": "align", "max_points": 4000}
     # One thread where threads would race: for random numbers, or for the order of a sum.
     return {
@@ -60,6 +62,18 @@ def methods() -> dict:
         "cfr_estimated": {
             "use": "cfr",
             "options": network | {"refine": False},
+            "estimated_normals": True,
+        },
+        # prepared as `align` prepares clouds for our network
+        "rpmnet": {
+            "use": "rpmnet",
+            "options": prepared | {"refine": False, "settings": {"optimized": False}},
+        },
+        "rpmnet_optim": {"use": "rpmnet", "options": prepared | {"refine": False}},
+        "rpmnet_optim_refined": {"use": "rpmnet", "options": prepared | {"refine": True}},
+        "rpmnet_optim_estimated": {
+            "use": "rpmnet",
+            "options": prepared | {"refine": False},
             "estimated_normals": True,
         },
     }

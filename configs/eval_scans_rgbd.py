@@ -13,6 +13,7 @@ def get_config() -> ConfigDict:
     config.limit = 0
     config.seed = 0
     config.weights = "object"
+    config.rpmnet_weights = "rpmnet"  # by name or path; RPM-Net is left out where there are none
     config.threads = 2
     config.timeout = 120.0  # seconds a pair
     config.unit = "m"
@@ -27,6 +28,7 @@ def methods() -> dict:
     """For rooms thinned to 2.5 cm; such pairs have no normals, so every method estimates them."""
     local = {"distances": (0.2, 0.1, 0.05)}
     features = {"normal_radius": 0.1, "feature_radius": 0.25, "voxel": 0.05}
+    prepared = {"through": "preparation", "max_points": 2000}
     network = {"through": "align", "max_points": 2000}
     # One thread where threads would race: for random numbers, or for the order of a sum.
     return {
@@ -54,4 +56,11 @@ def methods() -> dict:
         "kiss_matcher": {"use": "kiss_matcher", "options": {"voxel": 0.05}},
         "cfr": {"use": "cfr", "options": network | {"refine": False}},
         "cfr_refined": {"use": "cfr", "options": network | {"refine": True}},
+        # prepared as `align` prepares clouds for our network
+        "rpmnet": {
+            "use": "rpmnet",
+            "options": prepared | {"refine": False, "settings": {"optimized": False}},
+        },
+        "rpmnet_optim": {"use": "rpmnet", "options": prepared | {"refine": False}},
+        "rpmnet_optim_refined": {"use": "rpmnet", "options": prepared | {"refine": True}},
     }

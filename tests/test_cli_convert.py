@@ -6,11 +6,11 @@ import hashlib
 
 import numpy as np
 import pytest
-from oracle.authors import random_state_dict
+from oracle.authors import random_rpmnet_state_dict, random_state_dict
 
 from cfr_jax.cli import main
 from cfr_jax.convert import from_state_dict
-from cfr_jax.weights import read_weights
+from cfr_jax.weights import SHIPPED, read_weights
 
 
 @pytest.fixture
@@ -34,6 +34,22 @@ def test_converted_weights_can_be_loaded_and_say_what_they_were_made_from(
     assert weights.notes["converted_from"] == "authors.npz"
     digest = hashlib.sha256(checkpoint.read_bytes()).hexdigest()
     assert weights.notes["converted_from_sha256"] == digest
+
+
+def test_rpmnet_is_recognized_and_refused_where_our_network_is_wanted(tmp_path, capsys):
+    # given
+    np.savez(tmp_path / "theirs.npz", **random_rpmnet_state_dict(0))
+    path = tmp_path / "ours.safetensors"
+
+    # when
+    code = main(["convert", str(tmp_path / "theirs.npz"), "--out", str(path)])
+
+    # then
+    assert code == 0 and "RPM-Net" in capsys.readouterr().out
+    assert read_weights(path).network == "rpmnet"
+    clouds = (str(SHIPPED.parent / "demo" / f"{side}.ply") for side in ("source", "target"))
+    assert main(["register", *clouds, "--weights", str(path)]) == 2
+    assert "holds the network RPM-Net, wanted CFR" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,9 @@ def answering(monkeypatch):
 
         monkeypatch.setattr(report, "align", align)
         monkeypatch.setattr(
-            report, "read_weights", lambda name: Weights({}, f"<{name}>", "0" * 64, {})
+            report,
+            "read_weights",
+            lambda name, network: Weights({}, f"<{name}>", network, "0" * 64, {}),
         )
         return calls
 

@@ -11,6 +11,7 @@ from safetensors.numpy import save_file
 
 from cfr_jax.convert import convert, from_state_dict
 from cfr_jax.network import init_params
+from cfr_jax.weights import network_of
 
 
 def same(tree, other):
@@ -111,7 +112,7 @@ def test_every_faulty_tensor_is_named():
         from_state_dict(state, "authors.pth")
 
     message = str(caught.value)
-    assert message.startswith("authors.pth does not hold a CFR network: ")
+    assert message.startswith("authors.pth does not hold CFR: ")
     for fault in (
         "weights_net.prepool.4.bias is missing",
         "feat_extractor_xyz.nets_b.3.0.weight is missing",
@@ -137,9 +138,17 @@ def test_a_gap_among_the_iterations_is_named():
         from_state_dict(state)
 
 
-def test_rpmnet_is_not_taken_for_cfr():
-    with pytest.raises(ValueError, match="feat_extractor_ball.prepool.0.weight is missing"):
-        from_state_dict(authors.random_rpmnet_state_dict(0))
+def test_rpmnet_is_told_by_its_names():
+    # given a checkpoint that lacks a tensor, and another whole
+    broken = authors.random_rpmnet_state_dict(0, conv_rank=4)
+    del broken["feat_extractor.postpool.3.bias"]
+
+    # then
+    with pytest.raises(ValueError, match="not hold RPM-Net: feat_extractor.postpool.3.bias is mis"):
+        from_state_dict(broken)
+    whole = [from_state_dict(authors.random_rpmnet_state_dict(0, conv_rank=r)) for r in (3, 4)]
+    assert [network_of(params) for params in whole] == ["rpmnet", "rpmnet"]
+    assert jax.tree.all(jax.tree.map(np.array_equal, *whole))
 
 
 @pytest.mark.parametrize("name", ["missing.npz", "authors.ckpt"])

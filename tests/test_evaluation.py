@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation import records
 from cfr_jax.evaluation.datasets import nearest_motion, read_pairs
-from cfr_jax.evaluation.measuring import measure, summarize
+from cfr_jax.evaluation.measuring import measure, only, summarize
 from cfr_jax.evaluation.methods import Answer, Method, clouds_of, make_baseline, methods_of
 from cfr_jax.evaluation.records import Record, Records
 from cfr_jax.evaluation.running import run_method
@@ -214,7 +214,9 @@ def test_the_table_is_the_same_but_for_the_section_on_time():
         held.by_pair[3] = dataclasses.replace(held.by_pair[3], seconds=seconds)
         measured = measure("identity", held, pairs)
         numbers = {"identity": summarize(measured, about["thresholds"], seed=3)}
-        texts.append(write_table([measured], numbers, about, {"icp": "open3d is needed"}))
+        parts = ([only(measured, np.array([0, 4]))], {"identity": numbers["identity"]})
+        told = about | {"nearly_symmetric": 3}
+        texts.append(write_table([measured], numbers, told, {"icp": "open3d is needed"}, *parts))
 
     # then
     before = [text.split("## Time")[0] for text in texts]
@@ -223,6 +225,8 @@ def test_the_table_is_the_same_but_for_the_section_on_time():
     assert "recall 5°, 2 m" in before[0]
     assert "**icp**: not run, open3d is needed" in before[0]
     assert "**identity**, 1 pairs (2): no luck" in before[0]
+    assert "3 of the pairs are of shapes" in before[0]
+    assert before[0].count("| identity | 30.00 | 30.00 | 0.5000 |") == 2
 
 
 @pytest.mark.parametrize("kind", ["partial", "clean"])
@@ -337,7 +341,9 @@ def test_a_batch_answers_as_each_pair_alone(tmp_path, params):
     # given three pairs for batches of two: the second is filled up
     save_params(tmp_path / "w.safetensors", params)
     pairs = [a_pair(seed, points=70) for seed in range(3)]
-    solve = make_network(weights=str(tmp_path / "w.safetensors"), refine=False, batch=2)
+    solve = make_network(
+        network="cfr", weights=str(tmp_path / "w.safetensors"), refine=False, batch=2
+    )
 
     # when
     found = solve(pairs)
@@ -366,11 +372,17 @@ def test_clouds_of_any_size_go_through_align(monkeypatch):
         return Found
 
     monkeypatch.setattr(network, "align", align)
-    monkeypatch.setattr(network, "load_params", lambda weights: {})
+    monkeypatch.setattr(network, "load_params", lambda weights, network: {})
 
     # when
     solve = network.make_network(
-        weights="w", refine=True, through="align", max_points=9, seed=3, estimated=True
+        network="cfr",
+        weights="w",
+        refine=True,
+        through="align",
+        max_points=9,
+        seed=3,
+        estimated=True,
     )
     (answer,) = solve([a_pair()])
 
@@ -384,4 +396,188 @@ def test_a_network_goes_through_register_or_align_and_nothing_else(unchecked):
     from cfr_jax.evaluation import network
 
     with pytest.raises(ValueError, match="through is 'luck'"):
-        network.make_network(weights="w", refine=True, through="luck")
+        network.make_network(network="cfr", weights="w", refine=True, through="luck")
+
+
+def a_network(tmp_path, network: str, **options):
+    """A solver with random weights, eight neighbors and two iterations, and its parameters."""
+    from oracle import authors
+
+    from cfr_jax.convert import from_state_dict
+    from cfr_jax.evaluation.network import make_network
+    from cfr_jax.weights import save_params
+
+    made = {"cfr": authors.random_state_dict, "rpmnet": authors.random_rpmnet_state_dict}[network]
+    params = from_state_dict(made(0))
+    save_params(tmp_path / "w.safetensors", params)
+    solve = make_network(
+        network=network, weights=str(tmp_path / "w.safetensors"), refine=False, **options
+    )
+    return solve, params
+
+
+SMALL = {"neighbors": 8, "iterations": 2}
+
+
+@pytest.mark.parametrize("optimized", [True, False])
+def test_rpmnet_answers_a_batch_as_each_pair_alone(tmp_path, optimized):
+    import jax.numpy as jnp
+
+    from cfr_jax import rpmnet
+    from cfr_jax.registration import Cloud
+
+    # given
+    settings = SMALL | {"optimized": optimized}
+    solve, params = a_network(tmp_path, "rpmnet", settings=settings, batch=2)
+    ones = np.tile([0.0, 0.0, 1.0], (40, 1))
+    pairs = [
+        dataclasses.replace(a_pair(seed), source_normals=ones, target_normals=ones)
+        for seed in range(3)
+    ]
+
+    # when
+    found = solve(pairs)
+
+    # then
+    for pair, answer in zip(pairs, found, strict=True):
+        none = jnp.zeros((40, 1), jnp.int32)
+        clouds = (
+            Cloud(jnp.float32(x), jnp.float32(ones), none) for x in (pair.source, pair.target)
+        )
+        steps = rpmnet.unroll(params, *clouds, rpmnet.Settings(**settings))
+        alone = np.stack([step.transform for step in steps])
+        np.testing.assert_allclose(answer.transforms, alone, atol=2e-4)
+
+
+def test_a_prepared_cloud_has_the_size_of_the_network_and_its_padding_changes_nothing(tmp_path):
+    from cfr_jax import preparation, rpmnet
+    from cfr_jax.registration import Settings, prepare
+
+    # given a pair in millimeters
+    solve, params = a_network(tmp_path, "rpmnet", settings=SMALL, through="preparation")
+    pair = a_pair()
+    large = dataclasses.replace(pair, source=pair.source * 1e3, target=pair.target * 1e3)
+
+    # when
+    (found,) = solve([large])
+
+    # then it is the answer for the centered clouds as they are, without padding, in millimeters
+    frames = preparation.unit_frames(*clouds_of(pair, estimated=True), None)
+    unit = [
+        prepare(
+            np.float32((points - center) / frames.scale),
+            settings=Settings(neighbors=8),
+        )
+        for points, center in (
+            (pair.source, frames.source_center),
+            (pair.target, frames.target_center),
+        )
+    ]
+    steps = rpmnet.unroll(params, *unit, rpmnet.Settings(**SMALL))
+    wanted = frames.to_caller(np.stack([step.transform for step in steps]))
+    wanted[:, :3, 3] *= 1e3
+    np.testing.assert_allclose(found.transforms[:, :3, :3], wanted[:, :3, :3], atol=2e-4)
+    np.testing.assert_allclose(found.transforms[:, :3, 3], wanted[:, :3, 3], atol=1.0)
+
+
+@pytest.mark.parametrize("network", ["cfr", "rpmnet"])
+def test_the_modules_that_are_timed_are_those_of_a_registration(tmp_path, network):
+    from cfr_jax import registration, rigid, rpmnet
+    from cfr_jax.evaluation import modules
+
+    # given the parts of a registration of one iteration
+    _, params = a_network(tmp_path, network)
+    settings = {"neighbors": 8}
+    source, target = modules._clouds(a_pair(), estimated=True)
+    if network == "cfr":
+        params["cascade"] = {name: leaf[:1] for name, leaf in params["cascade"].items()}
+        out = params["annealing"]["out"]
+        params["annealing"]["out"] = {name: leaf[..., [0, 5]] for name, leaf in out.items()}
+        small = registration.Settings(**settings)
+        parts = modules._Cfr(params, small)
+        (step,) = registration.unroll(params, source, target, small)
+    else:
+        small = rpmnet.Settings(**settings, iterations=1)
+        parts = modules._Rpmnet(params, small)
+        (step,) = rpmnet.unroll(params, source, target, small)
+
+    # when the last part is run
+    *_, last = parts.of(source, target)
+
+    # then it leaves the source where a registration does
+    assert last.module == modules.MOTION
+    wanted = rigid.apply(step.transform, source.points)
+    np.testing.assert_allclose(last.function(*last.arguments), wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("network", "settings", "calls"),
+    [
+        ("cfr", {}, (2, 4, 1, 5, 5)),
+        ("cfr", {"repeat_annealing": True, "repeat_extraction": True}, (2, 8, 5, 5, 5)),
+        ("rpmnet", {}, (2, 10, 5, 5, 5)),
+        ("rpmnet", {"optimized": False}, (10, 10, 5, 5, 5)),
+    ],
+)
+def test_each_module_is_counted_as_often_as_it_runs(
+    tmp_path, monkeypatch, network, settings, calls
+):
+    from collections import Counter
+
+    from cfr_jax import registration, rpmnet
+    from cfr_jax.evaluation import modules
+
+    monkeypatch.setattr(modules.jax, "jit", lambda function, **_: lambda *_: (np.zeros(5),) * 2)
+    _, params = a_network(tmp_path, network)
+    kind = {"cfr": registration.Settings, "rpmnet": rpmnet.Settings}[network]
+    parts = {"cfr": modules._Cfr, "rpmnet": modules._Rpmnet}[network](params, kind(**settings))
+    counted = Counter()
+    for part in parts.of(*modules._clouds(a_pair(), estimated=True)):
+        counted[part.module] += part.times
+
+    assert tuple(counted.values()) == calls
+
+
+def test_weights_that_are_not_there_leave_their_method_out_and_no_other(tmp_path):
+    config = ConfigDict(
+        {
+            "weights": "object",
+            "rpmnet_weights": str(tmp_path / "nowhere.safetensors"),
+            "threads": 1,
+            "methods": {
+                "rpmnet": {"use": "rpmnet", "options": {"refine": False}},
+                "mine": {"use": "cfr", "options": {"refine": False}, "weights": "nobody"},
+                "cfr": {"use": "cfr", "options": {"refine": False}},
+            },
+        }
+    )
+    rpmnet, mine, cfr = methods_of(config, [], seed=0)
+    assert "nowhere.safetensors" in rpmnet.missing and "nobody" in mine.missing
+    assert cfr.missing is None
+    held = run_method(mine, [a_pair()], tmp_path / "part.json", timeout=1.0)
+    assert held.missing == mine.missing and not held.by_pair
+
+    # weights of the other network are an error, and so is a missing file that was asked for
+    config.rpmnet_weights = "object"
+    with pytest.raises(ValueError, match="holds the network CFR, wanted RPM-Net"):
+        methods_of(config, ["rpmnet"], seed=0)
+    config.weights = "nobody"
+    with pytest.raises(ValueError, match="no shipped weights called 'nobody'"):
+        methods_of(config, ["cfr"], seed=0)
+
+
+def test_the_errors_without_some_pairs_are_those_of_the_others():
+    # given two good answers and a bad one, and a failure
+    pairs = [a_pair(seed) for seed in range(4)]
+    held = answers(pairs, [pair.transform for pair in pairs[:2]] + [np.eye(4)] * 2)
+    held.by_pair[3] = Record("", failure="no luck")
+
+    # when
+    part = only(measure("m", held, pairs), np.array([0, 2, 3]))
+
+    # then
+    numbers = summarize(part, [(5.0, 0.1)], seed=0)
+    assert numbers["recall_5deg_0.1"].value == pytest.approx(1 / 3)
+    assert numbers["err_r_mean"].value == pytest.approx(15, abs=1e-5)
+    assert part.failures == {2: "no luck"}
+    assert len(part.chamfer) == 3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from cfr_jax import weights
+from cfr_jax import rpmnet, weights
 from cfr_jax.network import init_params
 
 
@@ -89,6 +89,29 @@ def test_another_network_is_refused(fresh, tmp_path, change, told):
 
     with pytest.raises(ValueError, match=f"^weights: .*{told}"):
         weights.read_weights(tmp_path / "other.safetensors")
+
+
+def test_a_file_knows_which_network_it_holds(fresh, saved, tmp_path):
+    # given weights of the two networks
+    other = tmp_path / "other.safetensors"
+    weights.save_params(other, jax.jit(rpmnet.init_params)(jax.random.key(0)))
+
+    # then each is read for what it is
+    assert weights.read_weights(saved).network == weights.network_of(fresh) == "cfr"
+    assert weights.read_weights(other).network == "rpmnet"
+    assert weights.network_of(weights.load_params(other, "rpmnet")) == "rpmnet"
+    with pytest.raises(ValueError, match="other.* holds the network RPM-Net, wanted CFR$"):
+        weights.load_params(other)
+    with pytest.raises(ValueError, match="mine.* holds the network CFR, wanted RPM-Net$"):
+        weights.load_params(saved, "rpmnet")
+
+
+def test_weights_with_a_shared_layer_come_back(tmp_path):
+    path = tmp_path / "shared.safetensors"
+    weights.save_params(
+        path, jax.jit(init_params, static_argnums=(1, 2))(jax.random.key(0), 3, True)
+    )
+    assert weights.load_params(path)["cascade"]["kernel"].shape == (1, 96, 96)
 
 
 def test_a_file_of_someone_else_is_refused(saved, tmp_path):

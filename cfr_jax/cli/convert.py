@@ -1,4 +1,4 @@
-"""`cfr convert`: the authors' PyTorch weights into ours."""
+"""`cfr convert`: the authors' PyTorch weights, of CFR or RPM-Net, into ours."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ Converts a checkpoint of the CFR authors' PyTorch program into weights for this 
 
   cfr convert authors.pth --out weights.safetensors
   cfr register a.ply b.ply --weights weights.safetensors
+
+A checkpoint of the RPM-Net authors' program is recognized by its names, and converted for
+evaluate.py, which compares the two.
 
 A .pth or .pt file is read by PyTorch (pip install "cfr_jax[torch]"), tensors only: nothing in it is
 run. A .safetensors or .npz file of the same tensors under the same names needs no PyTorch.
@@ -48,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     from cfr_jax import __version__
     from cfr_jax.convert import convert
     from cfr_jax.registration import iterations_of
-    from cfr_jax.weights import read_weights, save_params
+    from cfr_jax.weights import NETWORKS, network_of, read_weights, save_params
 
     params = convert(args.checkpoint)
     notes = {
@@ -57,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
         "converted_by": f"cfr_jax {__version__}",
     }
     save_params(args.out, params, notes)
-    print(f"wrote       {args.out}: {iterations_of(params)} iterations")
+    kind = network_of(params)
+    trained = f", {iterations_of(params)} iterations" if kind == "cfr" else ""
+    print(f"wrote       {args.out}: {NETWORKS[kind]}{trained}")
     print(f"sha256      {read_weights(args.out).sha256}")
     return 0

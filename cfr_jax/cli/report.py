@@ -49,7 +49,7 @@ def register(
     seed: int = 0,
 ) -> Result:
     """`align` with weights by name or path; raises ValueError as `align` and `read_weights` do."""
-    chosen = read_weights(DEFAULT if weights is None else weights)
+    chosen = read_weights(DEFAULT if weights is None else weights, "cfr")
     alignment = align(
         source,
         target,

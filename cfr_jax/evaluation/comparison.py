@@ -9,16 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 from tqdm import tqdm
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation import machine
 from cfr_jax.evaluation.datasets import read_pairs
-from cfr_jax.evaluation.measuring import Measured, measure, summarize
+from cfr_jax.evaluation.measuring import Measured, measure, only, summarize
 from cfr_jax.evaluation.methods import methods_of
 from cfr_jax.evaluation.records import Records
 from cfr_jax.evaluation.running import run_method
-from cfr_jax.evaluation.tables import write_table
+from cfr_jax.evaluation.symmetry import nearly_symmetric
+from cfr_jax.evaluation.tables import Numbers, write_table
 from cfr_jax.viewer.atomic import write_atomically
 
 
@@ -48,9 +50,15 @@ def compare(
     measured = [
         measure(name, each, pairs) for name, each in tqdm(run.items(), "measuring", disable=None)
     ]
-    numbers = {m.name: summarize(m, config.thresholds, config.seed) for m in measured}
+    numbers = _summaries(measured, config)
     about = _about(config, len(pairs), command)
-    table = write_table(measured, numbers, about, missing)
+    symmetric = nearly_symmetric(pairs, out / "cache" / "symmetries.json")
+    apart: list[Measured] = []
+    if symmetric is not None and 0 < symmetric.sum() < len(pairs):
+        apart = [only(m, np.flatnonzero(~symmetric)) for m in measured]
+    numbers_apart = _summaries(apart, config)
+    about["nearly_symmetric"] = None if symmetric is None else int(symmetric.sum())
+    table = write_table(measured, numbers, about, missing, apart, numbers_apart)
     results = {
         "about": about,
         "missing": missing,
@@ -59,8 +67,10 @@ def compare(
                 "settings": m.about,
                 "started": m.started,
                 "milliseconds": _number(m.milliseconds()),
-                "numbers": {key: n and n._asdict() for key, n in numbers[m.name].items()},
-                "pairs": _of_pairs(m, run[m.name], pairs),
+                "seconds_by_module": m.modules,
+                "numbers": _as_json(numbers[m.name]),
+                "numbers_without_symmetric": _as_json(numbers_apart.get(m.name, {})),
+                "pairs": _of_pairs(m, run[m.name], pairs, symmetric),
             }
             for m in measured
         },
@@ -72,6 +82,14 @@ def compare(
         for m in tqdm(measured, "gallery", disable=None):
             draw_gallery(out / "gallery" / f"{m.name}.png", m, run[m.name], pairs)
     return table
+
+
+def _summaries(measured: Sequence[Measured], config: Any) -> dict[str, Numbers]:
+    return {m.name: summarize(m, config.thresholds, config.seed) for m in measured}
+
+
+def _as_json(numbers: Numbers) -> dict[str, Any]:
+    return {key: number and number._asdict() for key, number in numbers.items()}
 
 
 def _about(config: Any, count: int, command: str) -> dict[str, Any]:
@@ -97,7 +115,9 @@ def _told(data: Any) -> str:
     return " ".join(f"{key}={value}" for key, value in data.to_dict().items())
 
 
-def _of_pairs(m: Measured, held: Records, pairs: Sequence[Pair]) -> list[dict[str, Any]]:
+def _of_pairs(
+    m: Measured, held: Records, pairs: Sequence[Pair], symmetric: Bool[np.ndarray, " p"] | None
+) -> list[dict[str, Any]]:
     told = []
     for index, pair in enumerate(pairs):
         record = held.by_pair[index]
@@ -106,6 +126,7 @@ def _of_pairs(m: Measured, held: Records, pairs: Sequence[Pair]) -> list[dict[st
                 "index": index,
                 "name": pair.name,
                 "overlap": _number(pair.overlap),
+                "nearly_symmetric": None if symmetric is None else bool(symmetric[index]),
                 "failure": record.failure,
                 "err_r": [_number(value) for value in m.err_r[index]],
                 "err_t": [_number(value) for value in m.err_t[index]],

@@ -64,6 +64,7 @@ def draw_all(
         by_quantity(folder / "by_overlap.png", shown, overlap, "overlap", about)
     by_iteration(folder / "by_iteration.png", shown, unit)
     time_against_accuracy(folder / "time.png", shown, about)
+    time_by_module(folder / "modules.png", [m for m in shown if m.modules])
 
 
 def recall_over_error(
@@ -145,6 +146,24 @@ def time_against_accuracy(path: Path, measured: Sequence[Measured], about: dict[
         axes.set(xscale="log", xlabel="ms per pair")
     left.set(ylabel="mean rotation error (degrees)")
     right.set(ylabel=_recall_label(about), ylim=(-0.02, 1.02))
+    _finish(figure, path)
+
+
+def time_by_module(path: Path, measured: Sequence[Measured]) -> None:
+    """A group of bars for each module, a bar for each method whose modules were timed."""
+    if not measured:
+        return
+    parts = list(dict.fromkeys(part for m in measured for part in m.modules or {}))
+    figure = new_figure(11, 4.2)
+    axes = figure.subplots()
+    width = 0.8 / len(measured)
+    for place, (style, m) in enumerate(_styled(measured)):
+        times = [(m.modules or {}).get(part, 0) * 1e3 for part in parts]
+        across = np.arange(len(parts)) + (place - (len(measured) - 1) / 2) * width
+        bars = axes.bar(across, times, width, color=style["color"], label=m.name)
+        axes.bar_label(bars, [f"{time:.3g}" for time in times], fontsize=7)
+    axes.set_xticks(range(len(parts)), parts)
+    axes.set(yscale="log", ylabel="ms per pair")
     _finish(figure, path)
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from cfr_jax import metrics
 from cfr_jax.data.pairs import Pair
@@ -32,6 +33,7 @@ class Measured:
     failures: dict[int, str]
     about: dict[str, Any]
     started: dict[str, Any] | None
+    modules: dict[str, float] | None = None
 
     @property
     def answered(self) -> Bool[np.ndarray, " p"]:
@@ -82,6 +84,20 @@ def measure(name: str, records: Records, pairs: Sequence[Pair]) -> Measured:
         failures={k: r.failure for k, r in records.by_pair.items() if r.failure is not None},
         about=records.made_with,
         started=records.started,
+        modules=records.modules,
+    )
+
+
+def only(measured: Measured, rows: Int[np.ndarray, " k"]) -> Measured:
+    """The same of some of the pairs."""
+    places = {int(row): place for place, row in enumerate(rows)}
+    return dataclasses.replace(
+        measured,
+        err_r=measured.err_r[rows],
+        err_t=measured.err_t[rows],
+        chamfer=None if measured.chamfer is None else measured.chamfer[rows],
+        seconds=measured.seconds[rows],
+        failures={places[k]: why for k, why in measured.failures.items() if k in places},
     )
 
 

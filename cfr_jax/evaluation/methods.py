@@ -18,13 +18,14 @@ from cfr_jax.io import PointCloud
 from cfr_jax.io.cloud import usable_normals
 
 OWN = "cfr"
+NETWORKS = (OWN, "rpmnet")
 TRUTH = "truth"
-_FIELDS = {"use", "options", "threads", "batch", "estimated_normals"}
+_FIELDS = {"use", "options", "weights", "threads", "batch", "estimated_normals", "modules"}
 # Whose seed changes the answer.
 _DRAWING = {"fgr", "fgr_icp", "ransac"}
 # Files that decide the answers of the peers, and of those methods that are made of our own code.
 _PEERS = ("baselines/*.py", "data/scans.py")
-_OURS = (*_PEERS, "*.py", "evaluation/network.py")
+_OURS = (*_PEERS, "*.py", "sinkhorn/*.py", "evaluation/network.py")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,14 +53,20 @@ class Method:
     batch: int = 1
     threads: int = 0
     """How many cores its process may use; 0 for all."""
+    missing: str | None = None
+    """Why it cannot be run at all."""
+    modules: Callable[[], Callable[[Sequence[Pair]], list[dict[str, float]]]] | None = None
+    """Makes what times the parts of the method, in seconds a pair."""
 
 
 def methods_of(config: Any, names: Sequence[str], seed: int) -> list[Method]:
     """The methods called `names` (none: all) in `config.methods`, in the order given.
 
-    Each entry says what to `use` (a name of `baselines.NAMES`, "truth", or "cfr") with which
-    `options`; perhaps on how many `threads` and in what `batch`, and whether normals are to be
-    `estimated_normals` even where the pairs have them. Raises ValueError for unknown ones.
+    Each entry says what to `use` (a name of `baselines.NAMES`, "truth", "cfr" or "rpmnet") with
+    which `options`; perhaps on how many `threads` and in what `batch`, and whether normals are to
+    be `estimated_normals` even where the pairs have them. A network may have `weights` of its own
+    instead of the config's, and its `modules` timed; where its own are not there, or RPM-Net's, the
+    method is left out. Raises ValueError for unknown methods, and for weights that are not sound.
     """
     unknown = [name for name in names if name not in config.methods]
     if unknown:
@@ -83,22 +90,35 @@ def _method(name: str, config: Any, seed: int) -> Method:
         "estimated_normals": estimated,
         "batch": batch,
         "threads": threads,
-        "code": code_digest(*(_OURS if use in (OWN, "gicp_jax") else _PEERS)),
+        "code": code_digest(*(_OURS if use in (*NETWORKS, "gicp_jax") else _PEERS)),
     }
     make: Callable[[], Solver]
-    if use == OWN:
-        from cfr_jax.weights import read_weights
+    modules = None
+    if use in NETWORKS:
+        from cfr_jax.weights import NoWeights, read_weights
 
-        weights = read_weights(config.weights)
+        own = entry.get("weights") or (None if use == OWN else config.rpmnet_weights)
+        source = own or config.weights
+        try:
+            weights = read_weights(source, use)
+        except NoWeights as error:
+            if own is None:
+                raise
+            return Method(name, _make_truth, about, missing=str(error))
         about |= {"weights": weights.name, "sha256": weights.sha256, "seed": seed}
         make = functools.partial(
             _make_own,
-            weights=config.weights,
+            network=use,
+            weights=source,
             estimated=estimated,
             batch=batch,
             seed=seed,
             **options,
         )
+        if entry.get("modules"):
+            modules = functools.partial(
+                _make_modules, use, source, options.get("settings"), estimated
+            )
     elif use == TRUTH:
         make = _make_truth
     elif use in NAMES:
@@ -106,8 +126,9 @@ def _method(name: str, config: Any, seed: int) -> Method:
             options["seed"] = about["seed"] = seed
         make = functools.partial(make_baseline, use, options, estimated)
     else:
-        raise ValueError(f"methods.{name}.use is {use!r}, wanted {OWN}, {TRUTH}, or one of {NAMES}")
-    return Method(name, make, about, batch, threads)
+        known = ", ".join((*NETWORKS, TRUTH))
+        raise ValueError(f"methods.{name}.use is {use!r}, wanted {known}, or one of {NAMES}")
+    return Method(name, make, about, batch, threads, modules=modules)
 
 
 def clouds_of(pair: Pair, estimated: bool) -> tuple[PointCloud, PointCloud]:
@@ -147,3 +168,9 @@ def _make_own(**options: Any) -> Solver:
     from cfr_jax.evaluation.network import make_network
 
     return make_network(**options)
+
+
+def _make_modules(*arguments: Any) -> Callable[[Sequence[Pair]], list[dict[str, float]]]:
+    from cfr_jax.evaluation.modules import make_modules
+
+    return make_modules(*arguments)

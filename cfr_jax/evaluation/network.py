@@ -1,4 +1,4 @@
-"""Our own method as a solver: in batches on clouds of one size, or through `align` on any."""
+"""The networks as solvers: in batches on clouds of one size, or pair by pair on clouds of any."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import functools
 import time
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import jax
@@ -13,44 +14,69 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfr_jax import refinement
+from cfr_jax import refinement, registration, rpmnet, solving
 from cfr_jax.alignment import align
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.methods import Answer, Solver, clouds_of
 from cfr_jax.neighbors import nearest_on_host
 from cfr_jax.normals import estimate_normals
-from cfr_jax.registration import Cloud, Settings, register
+from cfr_jax.planning import planned
+from cfr_jax.registration import Cloud
+from cfr_jax.training import Unroll
 from cfr_jax.weights import load_params
 
-_SETTINGS = Settings()
+KINDS: dict[str, tuple[Unroll, Any]] = {
+    "cfr": (registration.unroll, registration.Settings),
+    "rpmnet": (rpmnet.unroll, rpmnet.Settings),
+}
+"""By name: its iterations, and the settings of these."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """All that is compiled in."""
+
+    unroll: Unroll
+    settings: Any
+    refine: bool
+    vectorized: int
 
 
 def make_network(
     *,
+    network: str,
     weights: str,
     refine: bool,
-    through: Literal["register", "align"] = "register",
+    settings: dict[str, Any] | None = None,
+    through: Literal["register", "align", "preparation"] = "register",
     estimated: bool = False,
     batch: int = 1,
     vectorized: int = 1,
     max_points: int | None = None,
     seed: int = 0,
 ) -> Solver:
-    """The network of these weights, with or without refinement after its last iteration.
+    """A network of `KINDS` with these weights, `settings` other than its usual ones, with or
+    without refinement after its last iteration.
 
     "register" takes the clouds as they are, `batch` pairs a call, `vectorized` of them at a time
     (one keeps a CPU's caches warm, an accelerator wants many); the time of a pair is its share of
-    the call's. "align" brings clouds of any size and place to the network's, pair by pair, with
-    `max_points` and `seed` as `align` has them.
+    the call's. "align" (CFR only) is `align`, pair by pair, with its `max_points` and `seed`;
+    "preparation" brings clouds to the network's size and place as `align` does, for any network.
     """
-    if through not in ("register", "align"):
-        raise ValueError(f"through is {through!r}, wanted 'register' or 'align'")
-    params = load_params(weights)
+    if through not in ("register", "align", "preparation"):
+        raise ValueError(f"through is {through!r}, wanted 'register', 'align' or 'preparation'")
+    params = load_params(weights, network)
     if through == "align":
+        if network != "cfr" or settings:
+            raise ValueError("through 'align' is CFR as it is; wanted 'preparation' for others")
         return functools.partial(
             _align_each, params, refine, estimated, max_points=max_points, seed=seed
         )
-    return functools.partial(_register_batches, params, refine, estimated, batch, vectorized)
+    unroll, made = KINDS[network]
+    program = Program(unroll, made(**settings or {}), refine, vectorized)
+    if through == "preparation":
+        return functools.partial(_prepare_each, params, program, estimated, max_points, seed)
+    return functools.partial(_register_batches, params, program, estimated, batch)
 
 
 def _align_each(
@@ -66,8 +92,34 @@ def _align_each(
     return answers
 
 
+def _prepare_each(
+    params: dict,
+    program: Program,
+    estimated: bool,
+    max_points: int | None,
+    seed: int,
+    pairs: Sequence[Pair],
+) -> list[Answer]:
+    unit = registration.Settings(program.settings.neighbors, program.settings.radius)
+    answers = []
+    for pair in pairs:
+        clouds = clouds_of(pair, estimated)
+        began = time.perf_counter()
+        plan = planned(*clouds, max_points=max_points, seed=seed, settings=unit)
+        batches = [
+            Cloud(*(None if a is None else jnp.asarray(a)[None] for a in parts))
+            for parts in (
+                (u.points, u.normals, u.neighbors, u.mask) for u in (plan.source, plan.target)
+            )
+        ]
+        found, compiling = _run(program, params, *batches)
+        seconds = time.perf_counter() - began - compiling
+        answers.append(Answer(plan.frames.to_caller(found[0]), seconds))
+    return answers
+
+
 def _register_batches(
-    params: dict, refine: bool, estimated: bool, size: int, vectorized: int, pairs: Sequence[Pair]
+    params: dict, program: Program, estimated: bool, size: int, pairs: Sequence[Pair]
 ) -> list[Answer]:
     """Clouds of different sizes go into different batches; a short batch repeats its last pair."""
     rows = defaultdict(list)
@@ -79,12 +131,9 @@ def _register_batches(
             chosen = same[first : first + size]
             filled = chosen + [chosen[-1]] * (size - len(chosen))
             began = time.perf_counter()
-            clouds = _stacked([pairs[row] for row in filled], estimated)
-            prepared = time.perf_counter()
-            program = _compiled(refine, vectorized, *_signature((params, *clouds)))
-            compiled = time.perf_counter()
-            transforms = np.asarray(jax.device_get(program(params, *clouds)), np.float64)
-            seconds = prepared - began + time.perf_counter() - compiled
+            clouds = _stacked(program, [pairs[row] for row in filled], estimated)
+            transforms, compiling = _run(program, params, *clouds)
+            seconds = time.perf_counter() - began - compiling
             answers |= {
                 row: Answer(found, seconds / size)
                 for row, found in zip(chosen, transforms, strict=False)
@@ -92,8 +141,9 @@ def _register_batches(
     return [answers[row] for row in range(len(pairs))]
 
 
-def _stacked(pairs: Sequence[Pair], estimated: bool) -> list[Cloud]:
-    """Sources and targets as batches, neighbors found on the host."""
+def _stacked(program: Program, pairs: Sequence[Pair], estimated: bool) -> list[Cloud]:
+    """Sources and targets as batches, neighbors found on the host where they are of use."""
+    settings = program.settings
     sides = zip(*(clouds_of(pair, estimated) for pair in pairs), strict=True)
     stacked = []
     for clouds in sides:
@@ -102,8 +152,11 @@ def _stacked(pairs: Sequence[Pair], estimated: bool) -> list[Cloud]:
         without = [cloud.name for cloud in clouds if cloud.normals is None]
         if without and len(without) < len(clouds):
             raise ValueError("of one batch all clouds have normals or none; set batch to 1")
-        k = min(_SETTINGS.neighbors, len(points[0]) - 1)
-        found = [nearest_on_host(cloud, k, radius=_SETTINGS.radius) for cloud in points]
+        k = min(settings.neighbors, len(points[0]) - 1)
+        if isinstance(settings, rpmnet.Settings) and not without:
+            found = [np.zeros((len(cloud), 1), np.int32) for cloud in points]  # it has its own
+        else:
+            found = [nearest_on_host(cloud, k, radius=settings.radius) for cloud in points]
         stacked.append(
             Cloud(
                 points=jnp.asarray(np.stack(points)),
@@ -114,39 +167,36 @@ def _stacked(pairs: Sequence[Pair], estimated: bool) -> list[Cloud]:
     return stacked
 
 
-@functools.partial(jax.jit, static_argnames=("refine", "vectorized"))
+def _run(
+    program: Program, params: dict, sources: Cloud, targets: Cloud
+) -> tuple[Float[np.ndarray, "b i 4 4"], float]:
+    """Motions of a batch in host memory, and the seconds of it that were compilation."""
+    began = time.perf_counter()
+    compiled = solving.compiled(_solve, params, sources, targets, program=program)
+    compiling = time.perf_counter() - began
+    found = jax.device_get(compiled(params, sources, targets))
+    return np.asarray(found, np.float64), compiling
+
+
+@functools.partial(jax.jit, static_argnames=("program",))
 def _solve(
-    params: dict, sources: Cloud, targets: Cloud, *, refine: bool, vectorized: int
+    params: dict, sources: Cloud, targets: Cloud, *, program: Program
 ) -> Float[Array, "b i 4 4"]:
     def of_pair(pair):
         source, target = (_with_normals(cloud) for cloud in pair)
-        transforms = register(params, source, target, settings=_SETTINGS).transforms
-        if not refine:
+        steps = program.unroll(params, source, target, program.settings)
+        transforms = jnp.stack([step.transform for step in steps])
+        if not program.refine:
             return transforms
-        surfaces = (
-            refinement.Surface(cloud.points, cloud.normals, jnp.ones(len(cloud.points), bool))
-            for cloud in (source, target)
-        )
+        surfaces = solving.surface(source), solving.surface(target)
         refined = refinement.refine(*surfaces, transforms[-1]).transform
         return jnp.concatenate([transforms, refined[None]])
 
-    size = vectorized if vectorized > 1 else None
+    size = program.vectorized if program.vectorized > 1 else None
     return jax.lax.map(of_pair, (sources, targets), batch_size=size)
 
 
 def _with_normals(cloud: Cloud) -> Cloud:
     if cloud.normals is not None:
         return cloud
-    return cloud.replace(normals=estimate_normals(cloud.points, cloud.neighbors))
-
-
-def _signature(arguments: Any) -> tuple:
-    leaves, structure = jax.tree.flatten(arguments)
-    return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-
-
-@functools.cache
-def _compiled(refine: bool, vectorized: int, structure: Any, shapes: tuple) -> Any:
-    """Compiled ahead, so that the time of a call holds no compilation."""
-    arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    return _solve.lower(*arguments, refine=refine, vectorized=vectorized).compile()
+    return cloud.replace(normals=estimate_normals(cloud.points, cloud.neighbors, cloud.mask))

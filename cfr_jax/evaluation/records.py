@@ -36,6 +36,8 @@ class Records:
     started: dict[str, Any] | None = None
     missing: str | None = None
     by_pair: dict[int, Record] = dataclasses.field(default_factory=dict)
+    modules: dict[str, float] | None = None
+    """Seconds a pair of each part of the method."""
 
 
 def digest(pair: Pair) -> str:
@@ -79,6 +81,6 @@ def load(path: Path, made_with: dict[str, Any], pairs: list[str]) -> Records:
         kept = {int(k): Record(**record) for k, record in content["by_pair"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} is no file of results ({error!r}); remove it") from error
-    fresh.started = content["started"]
+    fresh.started, fresh.modules = content["started"], content.get("modules")
     fresh.by_pair = {k: r for k, r in kept.items() if k < len(pairs) and r.pair == pairs[k]}
     return fresh

@@ -6,6 +6,7 @@ import dataclasses
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -17,6 +18,7 @@ from cfr_jax.evaluation.records import Record, Records
 from cfr_jax.evaluation.worker import Failed, Missing, Worker
 
 _SAVE_EVERY = 5.0  # seconds
+_MODULE_PAIRS = 9
 _RIGID = 1e-3  # how far from orthonormal a rotation in float32 may be, generously
 
 
@@ -26,6 +28,9 @@ def run_method(method: Method, pairs: Sequence[Pair], path: Path, timeout: float
     A method that raises, crashes, takes more than `timeout` seconds or answers no rigid motion has
     failed on that pair, and goes on with the next. Of a batch that fails, each pair is tried alone.
     """
+    if method.missing is not None:
+        tqdm.write(f"{method.name} is left out: {method.missing}")
+        return Records(method.about, missing=method.missing)
     digests = [records.digest(pair) for pair in pairs]
     held = records.load(path, method.about, digests)
     # The method is not told the whole shapes.
@@ -56,8 +61,22 @@ def run_method(method: Method, pairs: Sequence[Pair], path: Path, timeout: float
                 records.save(path, held)
                 saved = time.monotonic()
     held.by_pair = dict(sorted(held.by_pair.items()))
+    if method.modules is not None and held.modules is None:
+        held.modules = _time_modules(method, given[:_MODULE_PAIRS], timeout)
     records.save(path, held)
     return held
+
+
+def _time_modules(method: Method, pairs: Sequence[Pair], timeout: float) -> dict[str, float] | None:
+    """Seconds a pair of each part of the method, medians of some pairs; None where that fails."""
+    timed: Any = dataclasses.replace(method, make=method.modules)
+    try:
+        with Worker(timed) as worker:
+            found: Any = worker.solve(pairs, timeout)
+    except (Failed, Missing) as error:
+        tqdm.write(f"{method.name}: its modules were not timed: {error}")
+        return None
+    return {name: float(np.median([each[name] for each in found])) for name in found[0]}
 
 
 def _solve(

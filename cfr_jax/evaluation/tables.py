@@ -20,24 +20,18 @@ def write_table(
     numbers: Mapping[str, Numbers],
     about: Mapping[str, Any],
     missing: Mapping[str, str],
+    apart: Sequence[Measured] = (),
+    numbers_apart: Mapping[str, Numbers] | None = None,
 ) -> str:
     """All of it: errors, their intervals, times, failures, settings.
 
-    `about` is what `running` knows of data and machine; `missing` tells why a method was left out.
-    Same answers, same text, but for the section `Time`.
+    `about` is what `running` knows of data and machine; `missing` tells why a method was left out;
+    `apart` and `numbers_apart` are the same without the pairs of nearly symmetric shapes. Same
+    answers, same text, but for the section `Time`.
     """
     unit = about["unit"]
     lengths = unit or "the unit of the clouds"
     columns = _columns(about["thresholds"], unit, any(m.chamfer is not None for m in measured))
-    rows = [
-        [m.name] + [_value(numbers[m.name][key], scale, form) for _, key, scale, form in columns]
-        for m in measured
-    ]
-    intervals = [
-        [m.name] + [_interval(numbers[m.name][key], scale, form) for _, key, scale, form in columns]
-        for m in measured
-    ]
-    header = ["method", *(title for title, *_ in columns)]
     lines = [
         f"# {about['title']}",
         "",
@@ -45,12 +39,9 @@ def write_table(
         f"{lengths}. Errors are over the pairs that a method answered; recall is over all pairs, "
         "and a failure is a miss.",
         "",
-        *_grid([*header, "failed"], [[*r, str(len(m.failures))] for r, m in _with(rows, measured)]),
+        *_errors(measured, numbers, columns),
         "",
-        "95 % intervals (bootstrap over pairs):",
-        "",
-        *_grid(header, intervals),
-        "",
+        *_apart(apart, numbers_apart or {}, columns, about),
         "## Settings",
         "",
         *(f"- **{m.name}**: {_settings(m.about)}" for m in measured),
@@ -69,10 +60,78 @@ def write_table(
             [_times(m) for m in measured],
         ),
         "",
+        *_modules(measured),
         f"    {about['command']}",
         "",
     ]
     return "\n".join(lines)
+
+
+def _errors(
+    measured: Sequence[Measured],
+    numbers: Mapping[str, Numbers],
+    columns: Sequence[tuple[str, str, float, str]],
+) -> list[str]:
+    """A row for each method, and once more with the intervals."""
+    header = ["method", *(title for title, *_ in columns)]
+    values, intervals = (
+        [
+            [m.name, *(tell(numbers[m.name][k], s, form) for _, k, s, form in columns)]
+            for m in measured
+        ]
+        for tell in (_value, _interval)
+    )
+    failed = [str(len(m.failures)) for m in measured]
+    return [
+        *_grid([*header, "failed"], [[*row, n] for row, n in zip(values, failed, strict=True)]),
+        "",
+        "95 % intervals (bootstrap over pairs):",
+        "",
+        *_grid(header, intervals),
+    ]
+
+
+def _apart(
+    measured: Sequence[Measured],
+    numbers: Mapping[str, Numbers],
+    columns: Sequence[tuple[str, str, float, str]],
+    about: Mapping[str, Any],
+) -> list[str]:
+    if not measured:
+        return []
+    return [
+        "## Without nearly symmetric shapes",
+        "",
+        f"{about['nearly_symmetric']} of the pairs are of shapes that some rotation lays on "
+        "themselves about as closely as sampling can tell (`cfr_jax/evaluation/symmetry.py`, a "
+        "rule on the shape alone); the others:",
+        "",
+        *_errors(measured, numbers, columns),
+        "",
+    ]
+
+
+def _modules(measured: Sequence[Measured]) -> list[str]:
+    """Milliseconds of the parts of a network, where they were timed."""
+    timed = {m.name: m.modules for m in measured if m.modules}
+    if not timed:
+        return []
+    parts = list(dict.fromkeys(part for seconds in timed.values() for part in seconds))
+    rows = [
+        [
+            name,
+            *(f"{seconds[part] * 1e3:.2f}" if part in seconds else _NONE for part in parts),
+            f"{sum(seconds.values()) * 1e3:.1f}",
+        ]
+        for name, seconds in timed.items()
+    ]
+    return [
+        "Milliseconds a pair by module, each compiled alone, device-synchronized, on the threads "
+        "above; medians of a few pairs:",
+        "",
+        *_grid(["method", *parts, "sum"], rows),
+        "",
+    ]
 
 
 def _columns(
@@ -104,10 +163,6 @@ def _interval(number: Statistic | None, scale: float, form: str) -> str:
     if number is None:
         return _NONE
     return f"{number.low * scale:{form}} to {number.high * scale:{form}}"
-
-
-def _with(rows: list[list[str]], measured: Sequence[Measured]) -> list[tuple[list[str], Measured]]:
-    return list(zip(rows, measured, strict=True))
 
 
 def _settings(about: Mapping[str, Any]) -> str:

@@ -62,8 +62,15 @@ def trace(
     iterations: int = 5,
     neighbors: int = 64,
     radius: float = 0.3,
+    passes: int | None = None,
+    anneal_again: bool = False,
+    extract_again: bool = False,
 ) -> Trace:
-    """`register`, with all intermediate results."""
+    """`register`, with all intermediate results.
+
+    The last three undo the paper's savings: so many Sinkhorn passes in every iteration; annealing
+    parameters, or the heavy features of both clouds, anew in each, from the moved source.
+    """
     x, y, nx, ny = (np.asarray(array, np.float64) for array in (x, y, nx, ny))
 
     x_neighbors = find_neighbors(x, neighbors, radius)
@@ -75,18 +82,24 @@ def trace(
     stored = len(parameters) // 2
     if iterations > stored:
         raise ValueError(f"iterations must be at most {stored} for these weights, got {iterations}")
-    beta, alpha = parameters[:iterations], parameters[stored : stored + iterations]
+    beta, alpha = parameters[:iterations].copy(), parameters[stored : stored + iterations].copy()
 
-    moved = x
+    moved, moved_normals = x, nx
     steps = []
     for i in range(iterations):
+        if anneal_again:
+            parameters = annealing(state_dict, moved, y)
+            beta[i], alpha[i] = parameters[i], parameters[stored + i]
+        if extract_again:
+            fx = extract(state_dict, raw_features(moved, moved_normals, x_neighbors))
+            fy = extract(state_dict, raw_features(y, ny, y_neighbors))
         fx = refine(state_dict, i, fx, moved)
         fy = refine(state_dict, i, fy, y)
         log_affinity = -beta[i] * (squared_distances(fx, fy) - alpha[i])
-        match = pieces.sinkhorn_log(log_affinity, passes=i + 1)
+        match = pieces.sinkhorn_log(log_affinity, passes=passes or i + 1)
         matched, weights = soft_target(match, y)
         transform = pieces.procrustes(x, matched, weights)  # always from the original source
-        moved = pieces.move(transform, x)
+        moved, moved_normals = pieces.move(transform, x), nx @ transform[:3, :3].T
         steps.append((transform, fx, fy, log_affinity, match, weights))
 
     transforms, x_features, y_features, log_affinities, matches, weights = (

@@ -1,0 +1,102 @@
+"""Shapes that lie almost as well on themselves another way: no method can tell which way is meant.
+
+The rule looks at the whole shape alone, never at an answer. A shape counts as nearly symmetric when
+some rotation lays it on itself about as closely as a second sampling of it would lie on the first:
+when the Chamfer distance between the shape and its rotated copy is at most `LIMIT` times the one
+that sampling alone makes. Tried are turns by 180, 120 and 72 degrees (every finite rotation group
+contains one by 360/p degrees, p prime, and a continuous one contains all) about the principal axes
+and the axes of the shape's own coordinates, through the centroid, each improved by a few steps of
+point-to-point ICP.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from cfr_jax.data.pairs import Pair
+from cfr_jax.viewer.atomic import write_atomically
+
+LIMIT = 2.0
+_TURNS = (180.0, 120.0, 72.0)  # degrees
+_LEAST = 30.0  # what ends closer to where it began is no other way to lie
+_SOME = 512  # points that choose among the turns
+_TRIED = 4  # turns that are improved
+_STEPS = 10
+
+
+def nearly_symmetric(pairs: Sequence[Pair], cache: Path) -> Bool[np.ndarray, " p"] | None:
+    """Which pairs are of such shapes; None where the pairs know no whole shapes.
+
+    The file `cache` keeps what was found, by the points of the shape.
+    """
+    if any(pair.clean_target is None for pair in pairs):
+        return None
+    found = json.loads(cache.read_text()) if cache.exists() else {}
+    known = len(found)
+    keys = []
+    for pair in tqdm(pairs, "symmetries", disable=None):
+        assert pair.clean_target is not None
+        points = np.asarray(pair.clean_target, np.float64)
+        keys.append(hashlib.sha256(points.tobytes()).hexdigest()[:16])
+        if keys[-1] not in found:
+            found[keys[-1]] = asymmetry(points)
+    if len(found) > known:
+        cache.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(cache, json.dumps(found).encode())
+    return np.array([found[key] <= LIMIT for key in keys])
+
+
+def asymmetry(points: Float[np.ndarray, "n 3"]) -> float:
+    """Chamfer distance of the shape and its best rotated copy, over that of two samplings of it.
+
+    Squared distances, summed over both directions. The second is twice the mean squared distance of
+    a point to the nearest other one. About 1 for a symmetric shape; 0 / 0, a shape without extent,
+    counts as symmetric.
+    """
+    points = np.asarray(points, np.float64)
+    points = points - points.mean(axis=0)
+    tree = cKDTree(points)
+    sampling = 2 * np.square(tree.query(points, 2)[0][:, 1]).mean()
+    if not sampling:
+        return 1.0
+    some = points[:: max(1, len(points) // _SOME)]
+    _, principal = np.linalg.eigh(points.T @ points)
+    axes = np.concatenate([principal.T, np.eye(3)])
+    turns = [
+        Rotation.from_rotvec(np.radians(angle) * axis).as_matrix()
+        for axis, angle in itertools.product(axes, _TURNS)
+    ]
+    turns.sort(key=lambda turn: float(np.square(tree.query(some @ turn.T)[0]).mean()))
+    best = np.inf
+    for turn in turns[:_TRIED]:
+        rotation, moved = _closer(points, tree, turn)
+        if Rotation.from_matrix(rotation).magnitude() < np.radians(_LEAST):
+            continue
+        there, back = tree.query(moved)[0], cKDTree(moved).query(points)[0]
+        best = min(best, np.square(there).mean() + np.square(back).mean())
+    return float(best / sampling)
+
+
+def _closer(
+    points: Float[np.ndarray, "n 3"], tree: cKDTree, rotation: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "n 3"]]:
+    """The rotation after some steps of ICP, and the points moved by the motion it belongs to."""
+    some = points[:: max(1, len(points) // _SOME)]
+    shift = np.zeros(3)
+    for _ in range(_STEPS):
+        targets = points[tree.query(some @ rotation.T + shift)[1]]
+        rotation = Rotation.align_vectors(targets - targets.mean(axis=0), some - some.mean(axis=0))[
+            0
+        ].as_matrix()
+        shift = targets.mean(axis=0) - some.mean(axis=0) @ rotation.T
+    return rotation, points @ rotation.T + shift
