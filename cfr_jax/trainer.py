@@ -45,11 +45,16 @@ class Learner:
 def learner(config: ml_collections.ConfigDict) -> Learner:
     """The network that `config.network` names: "cfr", or "rpmnet" to compare with."""
     if config.network == "cfr":
+        changed = dict(config.get("settings", {}))
         return Learner(
-            fresh=lambda key: network.init_params(key, config.iterations),
+            fresh=lambda key: network.init_params(
+                key, config.iterations, config.get("shared", False)
+            ),
             unroll=registration.unroll,
-            trained=lambda count: registration.Settings(neighbors=count, detach_motion=True),
-            validated=registration.Settings(),
+            trained=lambda count: registration.Settings(
+                neighbors=count, detach_motion=True, **changed
+            ),
+            validated=registration.Settings(**changed),
         )
     if config.network == "rpmnet":
         return Learner(

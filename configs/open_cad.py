@@ -9,6 +9,8 @@ def get_config() -> ConfigDict:
     config.seed = 0
     config.network = "cfr"
     config.iterations = 5
+    config.shared = False  # one light layer for all iterations, instead of one each
+    config.settings = ConfigDict()  # fields of `registration.Settings` other than the paper's
 
     config.data = ConfigDict()
     config.data.train = "../shared/data/open_cad/train.h5"  # any file in the ModelNet40 layout

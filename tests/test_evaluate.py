@@ -15,7 +15,8 @@ import pytest
 from cfr_jax.evaluation.methods import methods_of
 
 ROOT = Path(__file__).parents[1]
-CONFIGS = sorted((ROOT / "configs").glob("eval_*.py"))
+ABLATIONS = ROOT / "configs" / "eval_ablations.py"
+CONFIGS = sorted(set((ROOT / "configs").glob("eval_*.py")) - {ABLATIONS})
 
 
 def evaluate(*arguments: object) -> subprocess.CompletedProcess:
@@ -28,10 +29,14 @@ def evaluate(*arguments: object) -> subprocess.CompletedProcess:
 
 
 def read_config(path: Path):
+    return read_module(path).get_config()
+
+
+def read_module(path: Path):
     spec = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.get_config()
+    return module
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +91,8 @@ def test_missing_data_and_unknown_methods_are_told_in_a_line(arguments, tmp_path
 def test_every_config_names_methods_that_exist(path):
     config = read_config(path)
     made = methods_of(config, [], seed=0)
-    assert {"identity", "truth", "icp", "fgr", "ransac", "gicp", "cfr"} <= {m.name for m in made}
+    wanted = {"identity", "truth", "icp", "fgr", "ransac", "gicp", "cfr", "rpmnet", "rpmnet_optim"}
+    assert wanted <= {m.name for m in made}
     assert len(config.thresholds) == 3
     assert tuple(config.main_threshold) in [tuple(pair) for pair in config.thresholds]
 
@@ -107,3 +113,29 @@ def test_no_config_gives_a_baseline_an_option_that_it_does_not_take(path):
         assert options <= set(taken), name
         needed = {k for k, p in taken.items() if p.default is p.empty} - {"source", "target"}
         assert needed - {"options"} <= options, name
+
+
+def test_what_an_ablation_trains_is_what_it_measures():
+    from cfr_jax.evaluation.network import make_network
+    from cfr_jax.trainer import learner
+
+    evaluations, trainings = read_module(ABLATIONS), read_module(ROOT / "configs" / "ablations.py")
+    for name, variants in evaluations.ABLATIONS.items():
+        config = evaluations.get_config(name)
+        assert len(config.methods) == len(variants) == 2
+        for method, (run, settings) in variants.items():
+            entry = config.methods[method].to_dict()
+            made = make_network(network="cfr", weights="object", **entry["options"])
+            measured = made.args[1].settings
+            if run:
+                assert entry["weights"] == f"{config.runs}/{run}/weights.safetensors"
+                assert learner(trainings.get_config(run)).validated == measured, method
+            for field, value in settings.items():
+                assert getattr(measured, field) == value
+
+
+def test_an_ablation_that_does_not_exist_is_told_in_a_line():
+    command = [sys.executable, ROOT / "ablate.py", "--ablation=luck"]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 1
+    assert "no ablation 'luck': weights, passes" in run.stderr and "Traceback" not in run.stderr

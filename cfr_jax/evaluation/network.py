@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -21,10 +21,10 @@ from cfr_jax.evaluation.methods import Answer, Solver, clouds_of
 from cfr_jax.neighbors import nearest_on_host
 from cfr_jax.normals import estimate_normals
 from cfr_jax.planning import planned
-from cfr_jax.registration import Cloud
-from cfr_jax.training import Unroll
+from cfr_jax.registration import Cloud, Step
 from cfr_jax.weights import load_params
 
+Unroll = Callable[[dict, Cloud, Cloud, Any], Iterator[Step]]
 KINDS: dict[str, tuple[Unroll, Any]] = {
     "cfr": (registration.unroll, registration.Settings),
     "rpmnet": (rpmnet.unroll, rpmnet.Settings),

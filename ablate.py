@@ -1,0 +1,55 @@
+"""Trains and compares the variants of an ablation: python ablate.py --ablation=weights
+
+The ablations are weights, passes, sinkhorn, annealing, features and normals (`eval_ablations.py`).
+What has to be trained is trained by `train.py` in runs/ablations, shortly, and shared by all
+ablations; the rest is `evaluate.py`. Run the same command again and it goes on where it stopped.
+"""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+from absl import app, flags
+
+_HERE = Path(__file__).resolve().parent
+_EVALUATION = _HERE / "configs" / "eval_ablations.py"
+_ABLATION = flags.DEFINE_string("ablation", None, "Which of them.")
+_OUT = flags.DEFINE_string("out", None, "As of evaluate.py; results/ablations/NAME if not given.")
+_STEPS = flags.DEFINE_integer("steps", None, "Of every training, instead of the config's.")
+_LIMIT = flags.DEFINE_integer("limit", 300, "How many pairs to compare on; 0 for all.")
+
+
+def main(_) -> None:
+    """Runs `train.py` for each training that the ablation asks for, then `evaluate.py`."""
+    spec = importlib.util.spec_from_file_location("eval_ablations", _EVALUATION)
+    known = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(known)
+    name = _ABLATION.value
+    if name not in known.ABLATIONS:
+        raise SystemExit(f"ablate.py: error: no ablation {name!r}: {', '.join(known.ABLATIONS)}")
+    config = known.get_config(name)
+    for variant in config.trainings:
+        chosen = variant if _STEPS.value is None else f"{variant},{_STEPS.value}"
+        _run(
+            "train.py",
+            f"--config={_HERE / 'configs' / 'ablations.py'}:{chosen}",
+            f"--workdir={config.runs}/{variant}",
+        )
+    _run(
+        "evaluate.py",
+        f"--config={_EVALUATION}:{name}",
+        f"--limit={_LIMIT.value}",
+        f"--out={_OUT.value or f'results/ablations/{name}'}",
+    )
+
+
+def _run(program: str, *arguments: str) -> None:
+    done = subprocess.run([sys.executable, str(_HERE / program), *arguments])
+    if done.returncode:
+        raise SystemExit(done.returncode)
+
+
+if __name__ == "__main__":
+    flags.mark_flags_as_required(["ablation"])
+    app.run(main)

@@ -1,0 +1,43 @@
+"""Short trainings of the paper's network and of variants: --config=configs/ablations.py:shared
+
+Another number of steps is written behind: --config=configs/ablations.py:shared,3000. Data, loss and
+optimizer are those of `open_cad.py`. Every variant takes the same number of steps, a fraction of
+what a good model wants, on small clouds: enough to tell them apart, and no more. `ablate.py` runs
+them, and compares them at full size.
+"""
+
+import importlib.util
+from pathlib import Path
+
+from ml_collections import ConfigDict
+
+STEPS = 1000
+# What a variant does otherwise: `registration.Settings`, or one light layer for all iterations.
+VARIANTS = {
+    "cfr": {},
+    "shared": {"shared": True},
+    "constant_passes": {"settings": {"passes": 5}},
+    "annealing_each": {"settings": {"repeat_annealing": True}},
+    "extraction_each": {"settings": {"repeat_extraction": True}},
+}
+
+
+def get_config(chosen: str = "cfr") -> ConfigDict:
+    """Everything that `train.py` reads."""
+    variant, _, steps = chosen.partition(",")
+    config = _open_cad().get_config()
+    changes = VARIANTS[variant]
+    config.shared = changes.get("shared", False)
+    config.settings = ConfigDict(changes.get("settings", {}))
+    config.phases = ({"steps": int(steps or STEPS), "points": 256, "neighbors": 24, "batch": 8},)
+    config.validation_pairs = 93
+    return config
+
+
+def _open_cad():
+    # a config is a file and no module: it is found beside this one
+    path = Path(__file__).with_name("open_cad.py")
+    spec = importlib.util.spec_from_file_location("open_cad", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
