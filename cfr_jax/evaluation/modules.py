@@ -70,8 +70,8 @@ class _Cfr:
         self.settings, self.count = settings, registration.iterations_of(params)
         network = registration.bind(params)
         self.heavy = jax.jit(lambda cloud: _raw_cfr(network, cloud, settings))
-        self.light = jax.jit(network.cascade.at_rest)
-        self.annealing = jax.jit(network.annealing)
+        self.light = jax.jit(lambda *cloud: network.cascade.at_rest(*cloud))
+        self.annealing = jax.jit(lambda *clouds: network.annealing(*clouds))
         self.match = _matching(settings.match)
 
     def of(self, source: Cloud, target: Cloud) -> Iterator[Part]:
@@ -102,7 +102,7 @@ class _Rpmnet:
         network = rpmnet.bind(params)
         self.search = jax.jit(lambda cloud: rpmnet.find_neighbors(cloud, settings))
         self.extract = jax.jit(lambda cloud, ball: rpmnet.extract(network, cloud, ball))
-        self.annealing = jax.jit(network.annealing)
+        self.annealing = jax.jit(lambda *clouds: network.annealing(*clouds))
         self.match = _matching("auto" if settings.optimized else "log space")
 
     def of(self, source: Cloud, target: Cloud) -> Iterator[Part]:
