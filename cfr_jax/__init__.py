@@ -15,6 +15,8 @@ __version__ = "0.1.0"
 _HOMES = {
     "Alignment": "alignment",
     "align": "alignment",
+    "Outcome": "batch.stream",
+    "align_many": "batch.stream",
     "Cloud": "registration",
     "Encoded": "registration",
     "Registration": "registration",

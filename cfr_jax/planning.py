@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Any
@@ -43,8 +44,12 @@ def planned(
     max_points: int | None = None,
     seed: int = 0,
     settings: Settings = SETTINGS,
+    to_unit: Callable[..., preparation.UnitCloud] = preparation.to_unit,
 ) -> Plan:
-    """Reads, centers, scales and thins a pair; arguments and errors are those of `align`."""
+    """Reads, centers, scales and thins a pair; arguments and errors are those of `align`.
+
+    `to_unit` may stand in for `preparation.to_unit`, and remember what it made.
+    """
     source, target = read_clouds(source, target)
     if initial is not None:
         motions = rigid_motions(initial)
@@ -55,7 +60,7 @@ def planned(
     seed = whole("seed", seed, least=0)
     frames = preparation.unit_frames(source, target, initial)
     units = (
-        preparation.to_unit(
+        to_unit(
             cloud,
             center,
             frames.scale,

@@ -27,13 +27,16 @@ def pytest_configure(config):
 def pytest_sessionstart():
     # The fields of a result state the shapes of one pair. Coming out of vmap or a scan it is made
     # anew, with one more axis in front or with placeholders, and that is no mistake.
-    from cfr_jax import losses, registration, sinkhorn, training
+    from cfr_jax import confidence, losses, quality, registration, sinkhorn, solving, training
 
     for kind in (
         registration.Cloud,
         registration.Encoded,
         registration.Registration,
         sinkhorn.Affinity,
+        quality.Quality,
+        confidence.Clues,
+        solving.Found,
         losses.PairLoss,
         training.TrainState,
     ):

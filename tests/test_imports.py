@@ -22,7 +22,7 @@ LAYERS = (
     ("registration", "refinement"),
     ("rpmnet",),
     ("quality",),
-    ("losses", "metrics", "weights"),
+    ("losses", "metrics", "weights", "progress", "cards"),
     ("convert",),
     ("training",),
     ("checkpoints",),
@@ -33,6 +33,8 @@ LAYERS = (
     ("planning",),
     ("solving", "doubts"),
     ("alignment",),
+    ("batch",),
+    ("reproduction",),
     ("evaluation",),
     ("cli",),
     ("__main__",),
@@ -41,7 +43,7 @@ LAYERS = (
 KNOWS_ONLY = {
     "io": set(),
     "viewer": {"io"},
-    "data": {"io", "neighbors"},
+    "data": {"io", "neighbors", "progress"},
     "metrics": set(),
 }
 NUMERICAL_CORE = {name for layer in LAYERS[:6] for name in layer} | {"losses"}

@@ -77,6 +77,10 @@ def test_the_wheel_holds_every_file_of_the_package_and_no_other(wheel):
         "py.typed",
         "viewer/page.html",
         "cli/register.schema.json",
+        "cli/batch.schema.json",
+        "models/object.json",
+        "models/held_out.npz",
+        "models/held_out.md",
         "demo/source.ply",
         "demo/target.ply",
         "demo/truth.json",
@@ -94,7 +98,7 @@ def test_the_weights_that_are_loaded_by_default_are_in_the_wheel(wheel):
 
 
 def test_the_wheel_stays_small_enough_for_an_index(wheel):
-    assert sum(info.compress_size for info in wheel.infolist()) < 20e6
+    assert sum(info.compress_size for info in wheel.infolist()) < 10e6
 
 
 def test_the_metadata_carries_version_license_and_command(wheel):
@@ -120,7 +124,7 @@ def test_what_files_import_at_once_is_installed_always():
 def test_what_files_import_when_they_run_is_installed_by_a_dependency_or_an_extra():
     # given
     extras = PROJECT["optional-dependencies"]
-    offered = {name for key in ("io", "baselines", "viz", "torch", "rerun") for name in extras[key]}
+    offered = {name for key in extras if key != "dev" for name in extras[key]}
 
     # when
     needed = third_party_imports(at_the_top=False)
@@ -145,4 +149,5 @@ def test_every_extra_that_a_message_names_exists():
         )
         for extra in match.split(",")
     }
-    assert {"io", "viz", "torch", "rerun"} <= named <= set(PROJECT["optional-dependencies"])
+    wanted = {"io", "viz", "torch", "rerun", "completion"}
+    assert wanted <= named <= set(PROJECT["optional-dependencies"])

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from cfr_jax import __version__
-from cfr_jax.cli import convert, data, demo, register, view
+from cfr_jax.cli import batch, completion, convert, data, demo, models, register, reproduce, view
 
-_COMMANDS = (register, view, demo, convert, data)
+_COMMANDS = (register, batch, view, demo, models, reproduce, convert, data, completion)
 
 _DESCRIPTION = """\
 Registers 3D point clouds: finds the rigid motion that lays one cloud on another.
@@ -64,7 +64,7 @@ def _run(argv: Sequence[str] | None) -> int:
     where = "cfr"
     try:
         try:
-            args = _parser().parse_args(argv)
+            args = make_parser().parse_args(argv)
             where = f"cfr {args.command}"
             code = args.run(args)
         except SystemExit as stop:  # after help, or after `_Parser.error`
@@ -104,7 +104,8 @@ def _complaint(where: str, message: str, *hints: str) -> str:
     return "\n".join("\n".join(lines).splitlines()[:_MOST_LINES])
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """All commands with all their options."""
     parser = _Parser(
         prog="cfr",
         description=_DESCRIPTION,

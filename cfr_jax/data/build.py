@@ -18,12 +18,12 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from tqdm import tqdm
 
 from cfr_jax.data.duplicates import drop_duplicates
 from cfr_jax.data.meshes import SUFFIXES, read_mesh
 from cfr_jax.data.shapes import Shape, Unfit, make_shape, name_share
 from cfr_jax.io.mesh import Mesh
+from cfr_jax.progress import Progress
 
 RECIPE = "1"  # counted up when the same meshes would give another corpus
 VALIDATION_SHARE = 0.2
@@ -140,7 +140,7 @@ def build(
             shapes.append(made)
 
     def bar(pairs):
-        return tqdm(pairs, desc="comparing", unit=" pairs", disable=True if quiet else None)
+        return Progress(pairs, desc="comparing", unit=" pairs", disable=quiet)
 
     dropped = drop_duplicates(shapes, [item.category not in held_back for item in kept], bar)
     for row, other in dropped.items():
@@ -183,7 +183,7 @@ def _sampled(
             if other != folder:
                 shutil.rmtree(other)
     folder.mkdir(parents=True, exist_ok=True)
-    with tqdm(total=len(items), desc="sampling", unit=" meshes", disable=quiet or None) as bar:
+    with Progress(total=len(items), desc="sampling", unit=" meshes", disable=quiet) as bar:
         for start in range(0, len(items), _BLOCK):
             block = items[start : start + _BLOCK]
             path = folder / f"{start:06d}.npz"
@@ -194,13 +194,13 @@ def _sampled(
             yield from zip(block, _load_block(path), strict=True)
 
 
-def _attempt(item: Item, points: int, bar: tqdm) -> Shape | str:
+def _attempt(item: Item, points: int, bar: Progress) -> Shape | str:
     try:
         return make_shape(item.load(), item.name, points, item.least_faces)
     except Unfit as unfit:
         return str(unfit)
     except ValueError as error:
-        tqdm.write(f"left out: {error}") if not bar.disable else None
+        bar.write(f"left out: {error}") if not bar.disable else None
         return "cannot be read"
     finally:
         bar.update(1)

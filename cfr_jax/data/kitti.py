@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
-from tqdm import tqdm
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.data.protocol import random_motion, resample
 from cfr_jax.data.scans import estimate_normals, refine_point_to_plane, voxel_mean
+from cfr_jax.progress import Progress
 
 VOXEL = 0.3  # m
 NORMAL_RADIUS = 3.0  # m
@@ -169,7 +169,7 @@ def _refine(
     folder: Path, sequence: str, poses: np.ndarray, frames: np.ndarray
 ) -> tuple[Float[np.ndarray, "p 4 4"], Float[np.ndarray, " p"]]:
     transforms, fitness = np.empty((len(frames), 4, 4)), np.empty(len(frames))
-    for row, (source, target) in enumerate(tqdm(frames, f"KITTI {sequence}", disable=None)):
+    for row, (source, target) in enumerate(Progress(frames, f"KITTI {sequence}")):
         cloud = read_frame(folder, sequence, int(target))
         transforms[row], fitness[row] = refine_point_to_plane(
             read_frame(folder, sequence, int(source)),

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from tqdm import tqdm
+from cfr_jax.progress import Progress
 
 _MAGIC = b"!<arch>\n"
 _HEADER = 60  # bytes: name 16, date 12, owner 6, group 6, mode 8, size 10, end mark 2
@@ -100,8 +100,8 @@ def _data_tar(deb: Path, quiet: bool) -> Iterator[tarfile.TarFile]:
                     f"{deb}: {name} is packed in a way that Python 3.11 cannot read; repack it "
                     "with `dpkg-deb`, or take the package of Debian 12"
                 )
-            bar = {"total": deb.stat().st_size, "disable": quiet or None, "unit": "B"}
-            with tqdm.wrapattr(stream, "read", desc=deb.name.split("_")[0], **bar) as counted:
+            bar = {"total": deb.stat().st_size, "disable": quiet, "unit": "B", "unit_scale": True}
+            with Progress.wrapattr(stream, "read", desc=deb.name.split("_")[0], **bar) as counted:
                 # "r|": one pass over the stream, which ends at the tar's own end mark.
                 with tarfile.open(fileobj=counted, mode=f"r|{kind}") as tar:
                     yield tar

@@ -88,6 +88,11 @@ class CsvPairs(PairFile):
             raise ValueError(f"{self.path} lists no pair; wanted lines of `source,target`")
         self.names = tuple(f"{source} -> {target}" for source, target, _ in self._rows)
 
+    @property
+    def listed(self) -> list[tuple[str, str]]:
+        """Source and target of each pair, as the list has them."""
+        return [(source, target) for source, target, _ in self._rows]
+
     def _read(self, index: int) -> Pair:
         from cfr_jax.io import read  # reading formats pulls in what a mere list does not need
 

@@ -31,6 +31,7 @@ _READERS: dict[str, Callable[..., PointCloud | Mesh]] = {
     ".glb": gltf.parse_glb,
     ".gltf": gltf.parse_gltf,
 }
+SUFFIXES = tuple(_READERS)
 _WRITERS: dict[str, Callable[[BinaryIO, PointCloud], None]] = {
     ".ply": ply.save,
     ".pcd": pcd.save,

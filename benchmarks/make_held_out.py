@@ -1,0 +1,98 @@
+"""Makes the shapes that `cfr reproduce` measures on, from CC0 models in Debian.
+
+    apt-get download sweethome3d-furniture && python benchmarks/make_held_out.py *.deb
+
+They are the shapes of the open corpus' `test.h5` (categories that no network was trained on) that
+their authors released under CC0: the library BlendSwap-CC-0. Points and normals are sampled as for
+the corpus, and kept as integers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from cfr_jax.data.furniture import FurnitureLibrary
+from cfr_jax.data.open_cad import UNSEEN, category_of
+from cfr_jax.data.packages import extract
+from cfr_jax.data.shapes import make_shape
+
+LIBRARY = "usr/share/sweethome3d/furniture/BlendSwap-CC-0.sh3f"
+STEM = "BlendSwap-CC-0"
+POINTS = 2048
+# What of the library is in test.h5: other pieces of these categories were left out there as flat,
+# as copies, or as near copies of shapes that were trained on.
+PIECES = (
+    "armchair bidet chair chair2 couch2 designChair desklamp forkLift glassDoorCabinet lamp2 "
+    "modernVanity outdoorLamp plasticChair relaxChair shower showerDoor silla2 sillaBlanca sofa2 "
+    "stool stool2 toiletBrush toiletPaperDispenser wallLight"
+).split()
+
+CREDITS = """\
+# The held-out shapes
+
+`held_out.npz` holds {count} point clouds, sampled from models that their authors released under
+CC0 1.0 (public domain dedication, https://creativecommons.org/publicdomain/zero/1.0/) on
+blendswap.com. They were taken from Debian's package `sweethome3d-furniture` 1.8-1,
+`{library}`, and are released under CC0 1.0 as well.
+
+Made by `benchmarks/make_held_out.py`: {points} points a shape, drawn by area, with the normals of
+their faces, centered and scaled into the unit sphere; coordinates times 32767 as int16, normals
+times 127 as int8. All are of categories that the shipped weights were not trained on.
+
+| shape | category | author |
+|---|---|---|
+"""
+
+
+def main() -> None:
+    """Writes `held_out.npz` and `held_out.md`."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("package", type=Path, help="sweethome3d-furniture_*.deb or the .sh3f file")
+    parser.add_argument("--out", type=Path, default=Path("cfr_jax/models"))
+    args = parser.parse_args()
+
+    shapes, categories, credits = [], [], CREDITS.format(
+        count=len(PIECES), library=LIBRARY, points=POINTS
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        library = args.package
+        if library.suffix == ".deb":
+            (library,) = extract(library, lambda name: name == LIBRARY, Path(folder), quiet=True)
+        with FurnitureLibrary(library) as opened:
+            pieces = {piece.identifier: piece for piece in opened.pieces}
+            for name in PIECES:
+                piece = pieces[f"Blend Swap CC-0#{name}"]
+                path = f"{STEM}/{piece.identifier}"
+                category = category_of("furniture", f"{path}|{piece.name}|{piece.category}")
+                if category not in UNSEEN:
+                    raise SystemExit(f"{path} is of {category}, which is no unseen category")
+                mesh = opened.mesh(piece)
+                shapes.append(make_shape(mesh, f"sweethome3d:{path}", POINTS, least_faces=20))
+                categories.append(category)
+                credits += f"| {piece.name} (`{name}`) | {category} | {piece.creator} |\n"
+    arrays = {
+        "points": np.round(np.stack([shape.points for shape in shapes]) * 32767).astype(np.int16),
+        "normals": np.round(np.stack([shape.normals for shape in shapes]) * 127).astype(np.int8),
+        "names": np.array(PIECES),
+        "categories": np.array(categories),
+    }
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    for path, content in (
+        (args.out / "held_out.npz", stream.getvalue()),
+        (args.out / "held_out.md", credits.encode()),
+    ):
+        beside = path.with_name(f".{path.name}.part")
+        beside.write_bytes(content)
+        os.replace(beside, path)
+        print(f"wrote {path} ({len(content) / 1e3:.0f} kB)")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""Measures shipped weights on the shapes that ship, and writes that into their card.
+
+    python benchmarks/model_card.py object
+
+`cfr reproduce` holds later measurements against it. The card's other parts (what the weights are,
+their data, the scores of `evaluate.py`) are written by hand, and stay; of new weights, check them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+
+from cfr_jax import __version__, cards, reproduction
+from cfr_jax.evaluation import machine
+from cfr_jax.progress import Progress
+from cfr_jax.viewer.atomic import write_atomically
+from cfr_jax.weights import load_params
+
+
+def main() -> None:
+    """Updates `cfr_jax/models/NAME.json`."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("name", help="of the weights and their card")
+    path = cards.FOLDER / f"{parser.parse_args().name}.json"
+    card = json.loads(path.read_text("utf-8"))
+    sha256 = cards.file_facts(path.with_suffix(".safetensors"))["sha256"]
+    if card["sha256"] != sha256:
+        print(f"other weights than before: check `about`, `data` and `measured` in {path}")
+    with Progress(total=reproduction.PAIRS, desc="registering", unit=" pairs") as bar:
+        scores = reproduction.measure(load_params(card["name"]), bar.update)
+    card["sha256"] = sha256
+    card["reproduce"] = {
+        "on": reproduction.WHAT,
+        "expected": {
+            stage: {name: round(value, 4) for name, value in measured.items()}
+            for stage, measured in scores.items()
+        },
+        "tolerance": reproduction.TOLERANCE,
+        "measured_with": f"cfr_jax {__version__} ({machine.commit()}), "
+        f"{datetime.date.today()}, {machine.describe()}",
+    }
+    write_atomically(path, (json.dumps(card, indent=1, ensure_ascii=False) + "\n").encode())
+    print(json.dumps(card["reproduce"], indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+"""Plans of one size, solved together: each target encoded once, the pairs by `vmap`."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cfr_jax import solving
+from cfr_jax.alignment import Alignment, answer
+from cfr_jax.batch.memo import Memo
+from cfr_jax.planning import SETTINGS, Plan
+from cfr_jax.preparation import UnitCloud
+from cfr_jax.registration import Encoded, encode, prepare
+
+_KEPT = 32  # encoded targets, about 2 MB each
+
+
+class Device:
+    """What runs on the accelerator, with the targets it has encoded lately."""
+
+    def __init__(self, params: dict, refine: bool, size: int):
+        self._params, self._refine, self.size = params, refine, size
+        self._encoded = Memo(_KEPT)
+
+    def solve(self, plans: Sequence[Plan]) -> list[Alignment]:
+        """Answers of at most `size` plans of one `signature`; a short batch repeats its last plan,
+        so that it needs no program of its own."""
+        began = time.perf_counter()
+        filled = [*plans, *[plans[-1]] * (self.size - len(plans))]
+        targets, waited = zip(*(self._encode(plan.target) for plan in filled), strict=True)
+        arguments = (self._params, [solving.on_device(plan.source) for plan in filled], targets)
+        started = time.perf_counter()
+        program = solving.compiled(solve_many, *arguments, refine=self._refine)
+        compiled = time.perf_counter()
+        found = jax.device_get(program(*arguments))
+        done = time.perf_counter()
+        compiling = sum(waited) + compiled - started
+        seconds = {
+            "compile": compiling / len(plans),
+            "run": (done - began - compiling) / len(plans),
+            "total": (done - began) / len(plans),
+        }
+        return [
+            answer(plan, jax.tree.map(lambda leaf, row=row: leaf[row], found), seconds)
+            for row, plan in enumerate(plans)
+        ]
+
+    def _encode(self, target: UnitCloud) -> tuple[Encoded, float]:
+        """The features of a target, and how long their program took to compile."""
+        compiling = 0.0
+
+        def make() -> Encoded:
+            nonlocal compiling
+            arguments = (self._params, solving.on_device(target))
+            started = time.perf_counter()
+            program = solving.compiled(encode_target, *arguments)
+            compiling = time.perf_counter() - started
+            return program(*arguments)
+
+        return self._encoded.get(_digest(target), make), compiling
+
+
+def signature(plan: Plan) -> tuple:
+    """Equal for plans that one compiled program can solve."""
+    return tuple(
+        (cloud.points.shape, cloud.neighbors.shape, cloud.normals is None)
+        for cloud in (plan.source, plan.target)
+    )
+
+
+@jax.jit
+def encode_target(params: dict, target: dict[str, jax.Array]) -> Encoded:
+    """The target's side of `solving.solve`, for a cloud as `solving.on_device` hands it over."""
+    return encode(params, prepare(**target, settings=SETTINGS), settings=SETTINGS)
+
+
+@functools.partial(jax.jit, static_argnames=("refine",))
+def solve_many(
+    params: dict,
+    sources: Sequence[dict[str, jax.Array]],
+    targets: Sequence[Encoded],
+    *,
+    refine: bool,
+) -> solving.Found:
+    """`solving.solve` of pairs of one size, all at once; every leaf has the pairs in front."""
+
+    def solve(source: dict[str, jax.Array], target: Encoded) -> solving.Found:
+        return solving.solve(params, prepare(**source, settings=SETTINGS), target, refine=refine)
+
+    def stacked(clouds: Any) -> Any:
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
+
+    if len(sources) == 1:  # without an axis of length one, which slows a CPU down
+        return stacked([solve(sources[0], targets[0])])
+    return jax.vmap(solve)(stacked(sources), stacked(targets))
+
+
+def _digest(cloud: UnitCloud) -> bytes:
+    held = hashlib.sha256(repr(cloud.points.shape).encode())
+    for array in (cloud.points, cloud.normals, cloud.neighbors, cloud.mask):
+        held.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
+    return held.digest()

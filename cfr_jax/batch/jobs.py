@@ -1,0 +1,148 @@
+"""Which pairs are in a file or folder: names and how to read them, but no cloud read yet."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cfr_jax.data.layout import CLOUD_SUFFIXES, Layout, loose_files, scans_of
+from cfr_jax.data.meshes import SUFFIXES as MESH_SUFFIXES
+from cfr_jax.data.pairs import CsvPairs, Hdf5Pairs
+from cfr_jax.io import PointCloud
+from cfr_jax.io.cloud import usable_normals
+from cfr_jax.io.files import SUFFIXES as READABLE
+
+_ROLE = re.compile(r"(^|[._/-])(source|src|target|tgt|dst)(?=$|[._/-])")
+_TARGETS = ("target", "tgt", "dst")
+
+
+@dataclass(frozen=True)
+class Job:
+    """A pair by its names, which tell it from all others of its list."""
+
+    source: str
+    target: str
+    repeat: int
+    """How many pairs of these names come before it in the list."""
+    pair: tuple[Path, Path] | Callable[[], tuple[Any, Any]]
+    """As `align_many` takes it."""
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """What the journal knows it by."""
+        return self.source, self.target, self.repeat
+
+
+def jobs_of(layout: Layout, target: Path | None = None) -> tuple[list[Job], str]:
+    """The pairs of what was recognized, in order, and in words what was paired with what.
+
+    With `target` every cloud of a folder is laid on that one file. Raises ValueError where there
+    is no pair, and for data that are no pairs, with what they are for.
+    """
+    if target is not None and layout.kind not in ("clouds", "meshes", "kitti"):
+        raise ValueError(f"target: {layout.path} is {layout.found}, which says its own targets")
+    match layout.kind:
+        case "pair-list":
+            return _of_list(layout.path)
+        case "pair-file":
+            return _of_file(layout.path)
+        case "kitti":
+            files = [path for scans in scans_of(layout.path).values() for path in scans]
+        case "clouds":
+            files = loose_files(layout.path, CLOUD_SUFFIXES)
+        case "meshes":
+            suffixes = tuple(suffix for suffix in MESH_SUFFIXES if suffix in READABLE)
+            files = loose_files(layout.path, suffixes)
+        case _:
+            raise ValueError(
+                f"{layout.path} is {layout.found}: shapes, and no pairs\n"
+                "`evaluate.py` makes pairs of shapes, and `cfr data info` shows them"
+            )
+    return _of_files(layout, files, target)
+
+
+def _of_list(path: Path) -> tuple[list[Job], str]:
+    held = CsvPairs(path)
+    places = [tuple(path.parent / name for name in names) for names in held.listed]
+    if not any(file.exists() for place in places for file in place):
+        raise ValueError(
+            f"{path}: of its {len(places)} pairs no file is there, as {places[0][0]}\n"
+            "wanted lines of `source,target`, paths relative to the folder of the list"
+        )
+    return _numbered(held.listed, places), "pairs of a list"
+
+
+def _of_file(path: Path) -> tuple[list[Job], str]:
+    held = Hdf5Pairs(path)
+    names = [(f"{name}/source", f"{name}/target") for name in held.names]
+
+    def reader(index: int) -> Callable[[], tuple[PointCloud, PointCloud]]:
+        def read() -> tuple[PointCloud, PointCloud]:
+            pair = held[index]
+            sides = ((pair.source, pair.source_normals), (pair.target, pair.target_normals))
+            clouds = [
+                PointCloud(points, None if normals is None else usable_normals(normals), name)
+                for (points, normals), name in zip(sides, names[index], strict=True)
+            ]
+            return clouds[0], clouds[1]
+
+        return read
+
+    return _numbered(names, [reader(index) for index in range(len(held))]), "pairs of an HDF5 file"
+
+
+def _of_files(layout: Layout, files: list[Path], target: Path | None) -> tuple[list[Job], str]:
+    folder = layout.path
+    if target is not None:
+        if not target.is_file():
+            raise ValueError(f"target: there is no file {target}")
+        places = [(file, target) for file in files if not file.samefile(target)]
+        how = f"each of {len(places)} onto {target.name}"
+    elif places := _by_name(folder, files):
+        how = f"{len(places)} pairs named source and target"
+    else:
+        places = [
+            (file, before)
+            for before, file in zip(files, files[1:], strict=False)
+            if file.parent == before.parent
+        ]
+        how = "each onto the one before it, by name"
+    if not places:
+        raise ValueError(
+            f"{folder}: {layout.found}, and no two to lay on each other\n"
+            "give --target FILE, or a CSV list of `source,target` lines"
+        )
+    names = [tuple(_inside(folder, file) for file in place) for place in places]
+    return _numbered(names, places), how
+
+
+def _by_name(folder: Path, files: list[Path]) -> list[tuple[Path, Path]]:
+    """Files whose names differ in `source` and `target` alone (or src, tgt, dst), if all do."""
+    sides: tuple[dict[str, Path], dict[str, Path]] = {}, {}
+    for file in files:
+        inside = file.relative_to(folder).with_suffix("").as_posix()
+        role = _ROLE.search(inside.lower())
+        if role is None:
+            return []
+        rest = inside[: role.start(2)] + "*" + inside[role.end(2) :]
+        sides[role[2] in _TARGETS][rest] = file
+    if sides[0].keys() != sides[1].keys():
+        return []
+    return [(file, sides[1][rest]) for rest, file in sides[0].items()]
+
+
+def _inside(folder: Path, file: Path) -> str:
+    return str(file.relative_to(folder)) if file.is_relative_to(folder) else str(file)
+
+
+def _numbered(names: Sequence[Sequence[str]], pairs: Sequence[Any]) -> list[Job]:
+    seen: Counter[tuple[str, str]] = Counter()
+    jobs = []
+    for (source, target), pair in zip(names, pairs, strict=True):
+        jobs.append(Job(source, target, seen[source, target], pair))
+        seen[source, target] += 1
+    return jobs

@@ -1,0 +1,126 @@
+"""What became of each pair, one JSON line each, so that no kill loses an answer.
+
+A line is written in one go as soon as its pair is done. A line that a kill cut short is found when
+the file is opened again, and taken off. The first line says what the answers were made with.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+try:
+    import fcntl
+except ImportError:  # Windows: whoever starts two of one name there has to know better
+    fcntl = None  # type: ignore[assignment]
+
+FORMAT = "cfr_jax/batch/1"
+Key = tuple[str, str, int]
+
+
+class Journal:
+    """An open journal; close it, or use it in a `with` statement."""
+
+    def __init__(self, path: Path, made_with: dict[str, Any], retry: bool = False):
+        """Opens the journal at `path`, or begins it. With `retry`, pairs that failed count as not
+        done. Raises ValueError where another process has it open, where it was made with other
+        settings, and where it is no journal."""
+        self.path = path
+        self.done: dict[Key, dict[str, Any]] = {}
+        header = {"format": FORMAT, "made_with": made_with}
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            self._lock()
+            self._open(header)
+        except BaseException:
+            self.close()
+            raise
+        if retry:
+            self.done = {
+                key: record for key, record in self.done.items() if record["error"] is None
+            }
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Gives the file free for others."""
+        with contextlib.suppress(OSError):
+            os.close(self._file)
+
+    def adopt(self, path: Path, made_with: dict[str, Any]) -> None:
+        """Takes what another journal of the same settings holds for done, too."""
+        records = _records(path)
+        header = next(records, {})
+        if header.get("format") != FORMAT or "made_with" not in header:
+            raise ValueError(
+                f"{path} is there and is no journal of `cfr batch`\n"
+                "move it, or choose another --out"
+            )
+        theirs = header["made_with"]
+        differing = [name for name in made_with if theirs.get(name) != made_with[name]]
+        if differing:
+            name = differing[0]
+            raise ValueError(
+                f"{path} was begun with {name} {theirs.get(name)!r}, not {made_with[name]!r}\n"
+                "give the same options to go on, remove it to start anew, or choose another --out"
+            )
+        for record in records:
+            # Of a pair that was tried again the last line counts.
+            self.done[record["source"], record["target"], record["repeat"]] = record
+
+    def _open(self, header: dict[str, Any]) -> None:
+        data, start = self.path.read_bytes(), (json.dumps(header) + "\n").encode()
+        whole = data.rfind(b"\n") + 1
+        if whole or not start.startswith(data):
+            self.adopt(self.path, header["made_with"])  # before anything of it is changed
+        os.ftruncate(self._file, whole)
+        os.lseek(self._file, 0, os.SEEK_END)
+        if not whole:
+            self._append(header)
+
+    def write(self, record: dict[str, Any]) -> None:
+        """Adds the record of a pair, and takes it for done once it is on its way to the disk."""
+        self._append(record)
+        self.done[record["source"], record["target"], record["repeat"]] = record
+
+    def _append(self, value: dict[str, Any]) -> None:
+        line = memoryview((json.dumps(value, allow_nan=False) + "\n").encode())
+        while line:  # a signal or a full disk may cut a write short
+            line = line[os.write(self._file, line) :]
+
+    def _lock(self) -> None:
+        if fcntl is None:
+            return
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"{self.path} is being written by another `cfr batch`\n"
+                "wait for it, choose another --out, or split the work with --shard"
+            ) from None
+        except OSError:  # file systems without locks
+            return
+
+
+def _records(path: Path) -> Iterator[dict[str, Any]]:
+    with open(path, "rb") as stream:
+        for number, line in enumerate(stream, 1):
+            if not line.endswith(b"\n"):  # still being written, by another shard
+                return
+            try:
+                record = json.loads(line)
+                if not isinstance(record, dict) or (number > 1 and "source" not in record):
+                    raise ValueError("it is no record of a pair")
+            except ValueError as error:
+                raise ValueError(
+                    f"{path}, line {number} is damaged ({error}): remove the line"
+                ) from None
+            yield record

@@ -1,0 +1,38 @@
+"""Values that many threads ask for and one of them makes."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future
+from typing import Any
+
+
+class Memo:
+    """The last `most` values by key. Whoever asks for one that is being made waits for it."""
+
+    def __init__(self, most: int):
+        self._most = most
+        self._held: OrderedDict[Hashable, Future] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """The value of `key`, made by `make` if it is not there; what `make` raises is raised to
+        all who wait, and forgotten."""
+        with self._lock:
+            future = self._held.get(key)
+            mine = future is None
+            if mine:
+                future = self._held[key] = Future()
+                if len(self._held) > self._most:
+                    self._held.popitem(last=False)
+            self._held.move_to_end(key)
+        if mine:
+            try:
+                future.set_result(make())
+            except BaseException as error:
+                with self._lock:
+                    self._held.pop(key, None)
+                future.set_exception(error)
+        return future.result()

@@ -1,0 +1,45 @@
+"""One list over several machines: which share is this one's."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Shard(NamedTuple):
+    """Every `count`-th pair, from the `number`-th (1 to `count`) on."""
+
+    number: int
+    count: int
+
+    def rows(self) -> slice:
+        """What to take of the list."""
+        return slice(self.number - 1, None, self.count)
+
+    def beside(self, path: Path) -> Path:
+        """`path` with the shard in its name, so that shards never write over each other."""
+        return path.with_name(f"{path.stem}.{self.number}-of-{self.count}{path.suffix}")
+
+
+def parse_shard(text: str) -> Shard:
+    """`2/4` is the second of four shards; raises ValueError for anything else."""
+    match = re.fullmatch(r"(\d+)/(\d+)", text.strip())
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise ValueError(f"got {text!r}, wanted I/N with I from 1 to N, as 2/4; or auto")
+    return Shard(int(match[1]), int(match[2]))
+
+
+def process_shard() -> Shard | None:
+    """The share of this process among those of `jax.distributed`; None if it is not initialized."""
+    import jax
+
+    if not jax.distributed.is_initialized():
+        return None
+    return Shard(jax.process_index() + 1, jax.process_count())
+
+
+def other_shards(path: Path) -> list[Path]:
+    """Files beside `path` that are shards of it, by their names."""
+    name = re.compile(re.escape(path.stem) + r"\.\d+-of-\d+" + re.escape(path.suffix))
+    return sorted(file for file in path.parent.iterdir() if name.fullmatch(file.name))

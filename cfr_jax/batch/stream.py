@@ -1,0 +1,170 @@
+"""`align_many`: any number of pairs, answered as `align` answers each."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+
+from cfr_jax import preparation
+from cfr_jax.alignment import Alignment, checked_params
+from cfr_jax.batch.device import Device, signature
+from cfr_jax.batch.memo import Memo
+from cfr_jax.io import PointCloud, as_point_cloud
+from cfr_jax.planning import DEFAULT_BUDGET, Plan, planned, whole
+
+# More pairs a call keep an accelerator busy, and a CPU's caches cold.
+ON_CPU, ON_ACCELERATOR = 1, 16
+_TARGET_CLOUDS = 4  # whole clouds of files, which may be large
+_TARGET_UNITS = 64
+_MOST_WAITING = 8  # batches' worth of pairs, before one is solved that is not full
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one pair."""
+
+    index: int
+    """Its place among the pairs given, from 0."""
+    alignment: Alignment | None
+    error: str | None
+    """Why there is no alignment."""
+
+
+def align_many(
+    pairs: Iterable[Any],
+    *,
+    params: dict | None = None,
+    refine: bool = True,
+    max_points: int | None = None,
+    seed: int = 0,
+    batch: int | None = None,
+    workers: int | None = None,
+    ordered: bool = True,
+) -> Iterator[Outcome]:
+    """Aligns many pairs; yields one `Outcome` a pair, of which the generator is asked for.
+
+    A pair is `(source, target)` or `(source, target, initial)` as `align` takes them, or a function
+    without arguments that returns one, to be called when it is its turn. Pairs are drawn, read and
+    made ready ahead of their turn by `workers` threads (default: the cores there are, up to 4);
+    those of one padded size are solved `batch` at a time (default: 1 on a CPU, 16 on an
+    accelerator) by one `vmap`ped program. A target that many sources share, as the same file or
+    with the same points, is read and encoded once as long as it is among the last ones used.
+
+    With `ordered` the outcomes come in the order of the pairs, otherwise as they are done, which
+    holds none back. Answers are those of `align` up to the rounding of float32. A pair that cannot
+    be read or has no answer is an outcome with an `error`, and stops no other. Arrays given must
+    not be changed before their outcome has come.
+
+    Raises ValueError, before any pair is read, for options that are none.
+    """
+    budget = DEFAULT_BUDGET if max_points is None else whole("max_points", max_points, least=3)
+    seed = whole("seed", seed, least=0)
+    if batch is None:
+        batch = ON_CPU if jax.default_backend() == "cpu" else ON_ACCELERATOR
+    if workers is None:
+        workers = min(4, os.cpu_count() or 1)
+    device = Device(checked_params(params), refine, whole("batch", batch, least=1))
+    workers = whole("workers", workers, least=1)
+    done = _done(_Planner(budget, seed), pairs, device, workers)
+    return _in_order(done) if ordered else done
+
+
+class _Planner:
+    """Pairs made ready, by many threads at once; targets that come again are not made again."""
+
+    def __init__(self, budget: int, seed: int):
+        self._options = {"max_points": budget, "seed": seed}
+        self._clouds, self._units = Memo(_TARGET_CLOUDS), Memo(_TARGET_UNITS)
+
+    def __call__(self, pair: Any) -> Plan:
+        source, target, initial = _unpacked(pair() if callable(pair) else pair)
+        if isinstance(target, (str, os.PathLike)):
+            place = os.path.realpath(target)
+            target = self._clouds.get(place, lambda: as_point_cloud(target, name="target"))
+
+        def to_unit(cloud: PointCloud, *place: Any, **options: Any) -> preparation.UnitCloud:
+            def make() -> tuple[PointCloud, preparation.UnitCloud]:
+                return cloud, preparation.to_unit(cloud, *place, **options)
+
+            if cloud is not target:
+                return make()[1]
+            center, scale, motion = place
+            # the cloud is kept beside, so that no other gets its id
+            key = id(cloud), center.tobytes(), scale, motion.tobytes()
+            return self._units.get(key, make)[1]
+
+        return planned(source, target, initial=initial, to_unit=to_unit, **self._options)
+
+
+def _done(plan: _Planner, pairs: Iterable[Any], device: Device, workers: int) -> Iterator[Outcome]:
+    """Outcomes as they come; the bucket that holds the oldest pair goes first where many wait."""
+    waiting: dict[tuple, list[tuple[int, Plan]]] = {}
+
+    def solve(key: tuple) -> Iterator[Outcome]:
+        rows, plans = zip(*waiting.pop(key), strict=True)
+        for row, alignment in zip(rows, device.solve(plans), strict=True):
+            yield Outcome(row, alignment, None)
+
+    for index, future in _ahead(plan, pairs, workers, 2 * device.size + workers):
+        try:
+            ready = future.result()
+        except Exception as error:  # whatever a file may hold, it is this pair's failure
+            yield Outcome(index, None, _reason(error))
+            continue
+        key = signature(ready)
+        waiting.setdefault(key, []).append((index, ready))
+        if len(waiting[key]) == device.size:
+            yield from solve(key)
+        elif sum(map(len, waiting.values())) >= _MOST_WAITING * device.size:
+            yield from solve(min(waiting, key=lambda key: waiting[key][0][0]))
+    while waiting:
+        yield from solve(next(iter(waiting)))
+
+
+def _ahead(
+    plan: Callable[[Any], Plan], pairs: Iterable[Any], workers: int, most: int
+) -> Iterator[tuple[int, Future]]:
+    """Each pair's plan in the order of the pairs, up to `most` begun before they are asked for."""
+    pool = ThreadPoolExecutor(workers, thread_name_prefix="cfr-read")
+    begun: deque[tuple[int, Future]] = deque()
+    try:
+        for index, pair in enumerate(pairs):
+            begun.append((index, pool.submit(plan, pair)))
+            if len(begun) >= most:
+                yield begun.popleft()
+        while begun:
+            yield begun.popleft()
+    finally:  # also where nobody asks for more
+        pool.shutdown(cancel_futures=True)
+
+
+def _in_order(outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
+    early: dict[int, Outcome] = {}
+    next_index = 0
+    for outcome in outcomes:
+        early[outcome.index] = outcome
+        while next_index in early:
+            yield early.pop(next_index)
+            next_index += 1
+
+
+def _unpacked(pair: Any) -> tuple[Any, Any, Any]:
+    if not isinstance(pair, (tuple, list)) or len(pair) not in (2, 3):
+        count = f" of {len(pair)}" if isinstance(pair, (tuple, list)) else ""
+        raise ValueError(
+            f"pair: got a {type(pair).__name__}{count}, wanted (source, target) or "
+            "(source, target, initial)"
+        )
+    return (*pair, None)[:3]
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, (ValueError, OSError)):
+        return str(error)
+    return f"{type(error).__name__}: {error}"

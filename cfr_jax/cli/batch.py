@@ -1,0 +1,221 @@
+"""`cfr batch PAIRS --out results.csv`: many pairs, and no answer lost on the way."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cfr_jax.cli import numbers, outputs
+
+if TYPE_CHECKING:
+    from cfr_jax.batch.jobs import Job
+    from cfr_jax.batch.journal import Journal
+    from cfr_jax.batch.sharding import Shard
+
+UNTRUSTED = 3
+
+_DESCRIPTION = """\
+Registers many pairs. PAIRS is recognized by its layout, which is told before anything is done:
+
+  a CSV list of `source,target` lines   paths relative to the list's folder; a line may go on with
+                                        16 numbers, the known truth, which is not used here
+  an HDF5 file of pairs                 a group a pair with source (N, 3) and target (M, 3)
+  a folder of clouds or meshes          onto --target; or a_source.ply onto a_target.ply; or each
+                                        file onto the one before it
+  a folder of KITTI odometry            each scan onto the one before it
+
+Two files are written. results.jsonl holds everything that is known, a line a pair, each written as
+soon as its pair is done. results.csv, the table in the order of the pairs, appears when all are.
+Run the same command again after a crash, a kill or Ctrl-C, and it goes on where it stopped. A pair
+that cannot be read is a row with the reason, and stops no other.
+"""
+
+_EPILOG = """\
+examples:
+  cfr batch pairs.csv --out results.csv
+  cfr batch scans/ --target model.ply --out results.csv   the target is encoded once
+  cfr batch pairs.csv --out results.csv --retry-failed    after the bad files were mended
+  cfr batch pairs.csv --out results.csv --shard 2/4       on the second of four machines; without
+                                                          --shard, the table of all of them
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Adds `cfr batch`."""
+    parser = commands.add_parser(
+        "batch",
+        help="many pairs, from a list or a folder, into one table",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument("pairs", metavar="PAIRS", type=Path, help="a list, a file or a folder")
+    parser.add_argument(
+        "--out", metavar="FILE.csv", type=Path, required=True, help="where the table goes"
+    )
+    parser.add_argument(
+        "--layout", metavar="KIND", help="what PAIRS is, where it is not recognized as it should be"
+    )
+    parser.add_argument(
+        "--target", metavar="FILE", type=Path, help="the target of every cloud in a folder"
+    )
+    parser.add_argument(
+        "--retry-failed", action="store_true", help="try the pairs again that failed before"
+    )
+    parser.add_argument(
+        "--shard",
+        metavar="I/N",
+        help="every N-th pair, from the I-th on; auto: as the cluster tells jax.distributed",
+    )
+    parser.add_argument(
+        "--strict",
+        action="store_true",
+        help=f"exit with {UNTRUSTED} if a pair failed or is not to be trusted",
+    )
+    how = parser.add_argument_group("how to register")
+    how.add_argument("--no-refine", action="store_true", help="the network's own answers")
+    how.add_argument("--weights", metavar="W", help="a shipped name, or a .safetensors file")
+    how.add_argument(
+        "--max-points", metavar="N", type=numbers.positive, help="most points of each cloud"
+    )
+    how.add_argument(
+        "--seed", metavar="S", type=numbers.not_negative, default=0, help="of the choice of points"
+    )
+    how.add_argument(
+        "--batch-size",
+        metavar="N",
+        type=numbers.positive,
+        help="pairs solved at once (default: 1 on a CPU, 16 on an accelerator)",
+    )
+    how.add_argument(
+        "--workers", metavar="N", type=numbers.positive, help="threads that read ahead"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Refuses what can be refused, does what is not done yet, writes the table."""
+    outputs.check_output("--out", args.out, (".csv",))
+    outputs.check_apart([args.pairs, *filter(None, [args.target])], [args.out])
+
+    from cfr_jax.batch.jobs import jobs_of
+    from cfr_jax.data.layout import recognize
+
+    layout = recognize(args.pairs, args.layout)
+    jobs, how = jobs_of(layout, args.target)
+    shard = _shard(args.shard)
+    print(f"recognized  {layout}")
+    print(f"pairs       {len(jobs)}: {how}")
+    out = args.out
+    if shard is not None:
+        jobs, out = jobs[shard.rows()], shard.beside(args.out)
+        print(f"shard       {shard.number} of {shard.count}: {len(jobs)} pairs")
+
+    from cfr_jax.batch.journal import Journal
+    from cfr_jax.batch.sharding import other_shards
+    from cfr_jax.cli.cache import keep_compiled_programs
+    from cfr_jax.weights import DEFAULT, read_weights
+
+    keep_compiled_programs()
+    weights = read_weights(DEFAULT if args.weights is None else args.weights)
+    made_with = {
+        "weights": weights.sha256,
+        "refine": not args.no_refine,
+        "max_points": args.max_points,
+        "seed": args.seed,
+    }
+    kept = out.with_suffix(".jsonl")
+    outputs.check_output("--out", kept)
+    with Journal(kept, made_with, retry=args.retry_failed) as journal:
+        for other in other_shards(kept) if shard is None else ():
+            journal.adopt(other, made_with)
+        left = [job for job in jobs if job.key not in journal.done]
+        if len(left) < len(jobs):
+            print(f"done before {len(jobs) - len(left)}")
+        try:
+            _register(left, journal, weights.params, args)
+        except KeyboardInterrupt:
+            print(
+                f"cfr batch: stopped; {kept} keeps what is done\n"
+                "the same command goes on from there",
+                file=sys.stderr,
+            )
+            raise
+        records = [journal.done[job.key] for job in jobs]
+    return _tell(records, out, kept, args.strict)
+
+
+def _register(left: list[Job], journal: Journal, params: dict, args: argparse.Namespace) -> None:
+    from cfr_jax.batch.records import as_record
+    from cfr_jax.batch.stream import align_many
+    from cfr_jax.progress import Progress
+
+    if not left:
+        return
+    outcomes = align_many(
+        (job.pair for job in left),
+        params=params,
+        refine=not args.no_refine,
+        max_points=args.max_points,
+        seed=args.seed,
+        batch=args.batch_size,
+        workers=args.workers,
+        ordered=False,
+    )
+    failed = 0
+    with Progress(total=len(left), desc="registering", unit=" pairs") as bar:
+        for outcome in outcomes:
+            journal.write(as_record(left[outcome.index], outcome))
+            failed += outcome.error is not None
+            if failed:
+                bar.set_postfix_str(f"{failed} failed", refresh=False)
+            bar.update()
+
+
+def _tell(records: list[dict[str, Any]], out: Path, kept: Path, strict: bool) -> int:
+    from cfr_jax.batch.records import as_table
+    from cfr_jax.viewer.atomic import write_atomically
+
+    write_atomically(out, as_table(records).encode())
+    failed = [record for record in records if record["error"] is not None]
+    trusted = sum(bool(record["trusted"]) for record in records)
+    print(f"registered  {len(records) - len(failed)}, of these {trusted} trusted")
+    for record in failed[:3]:
+        print(f"failed      {record['source']} -> {record['target']}: {record['error']}")
+    if len(failed) > 3:
+        print(f"failed      {len(failed) - 3} more, see {out}")
+    print(f"wrote       {out}")
+    print(f"wrote       {kept}")
+    if records and len(failed) == len(records):
+        raise ValueError(
+            f"none of the {len(records)} pairs could be registered: {failed[0]['error']}\n"
+            f"mend the files and add --retry-failed; every reason is in {out}"
+        )
+    return UNTRUSTED if strict and trusted < len(records) else 0
+
+
+def _shard(wish: str | None) -> Shard | None:
+    from cfr_jax.batch.sharding import parse_shard, process_shard
+
+    if wish is None:
+        return None
+    if wish != "auto":
+        try:
+            return parse_shard(wish)
+        except ValueError as error:
+            raise ValueError(f"--shard: {error}") from None
+
+    import jax
+
+    try:
+        if not jax.distributed.is_initialized():
+            jax.distributed.initialize()
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(
+            f"--shard auto: no cluster tells this process its number ({error})\n"
+            "give --shard I/N instead"
+        ) from None
+    return process_shard()

@@ -1,0 +1,80 @@
+"""`cfr reproduce NAME`: measures shipped weights again, on shapes that ship, too."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from cfr_jax.cli import models, outputs
+
+FORMAT = "cfr_jax/reproduce/1"
+MISSED = 3
+
+_DESCRIPTION = f"""\
+Measures weights that ship (`cfr models` lists them) once more, on pairs of held-out shapes that
+ship, too, and says whether the score on their card holds here. Takes a minute or two.
+
+Exits with {MISSED} if a score is worse than published by more than its tolerance, which leaves room
+for another processor's rounding.
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Adds `cfr reproduce`."""
+    parser = commands.add_parser(
+        "reproduce",
+        help="measure the weights again, against their published score",
+        description=_DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument("name", metavar="NAME", help="weights by name, as `cfr models` lists them")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="the scores, as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measures, and holds the scores against those of the card."""
+    if args.json is not None:
+        outputs.check_output("--json", args.json)
+
+    from cfr_jax import cards
+
+    card = cards.read_card(args.name)
+
+    from cfr_jax import __version__, reproduction
+    from cfr_jax.cli.cache import keep_compiled_programs
+    from cfr_jax.progress import Progress
+    from cfr_jax.viewer.atomic import write_atomically
+    from cfr_jax.weights import load_params
+
+    keep_compiled_programs()
+    published: dict[str, Any] = card["reproduce"]
+    print(f"{args.name} on {published['on']}")
+    with Progress(total=reproduction.PAIRS, desc="registering", unit=" pairs") as bar:
+        scores = reproduction.measure(load_params(args.name), bar.update)
+    missed = reproduction.missed(scores, published["expected"], published["tolerance"])
+    for stage, measured in scores.items():
+        print(f"{stage}, measured   {models.scores_in_words(measured)}")
+        print(f"{stage}, published  {models.scores_in_words(published['expected'][stage])}")
+    if args.json is not None:
+        document = {
+            "format": FORMAT,
+            "version": __version__,
+            "name": args.name,
+            "sha256": card["sha256"],
+            "on": published["on"],
+            "measured": scores,
+            "expected": published["expected"],
+            "tolerance": published["tolerance"],
+            "holds": not missed,
+            "missed": missed,
+        }
+        write_atomically(args.json, (json.dumps(document, indent=2) + "\n").encode())
+        print(f"wrote       {args.json}")
+    for text in missed:
+        print(f"missed      {text}")
+    print("the published score does not hold" if missed else "the published score holds")
+    return MISSED if missed else 0

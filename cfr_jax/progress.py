@@ -1,0 +1,51 @@
+"""Progress: a bar on a terminal, and plain lines where standard error is piped or logged."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from tqdm import tqdm
+
+_SECONDS = 10.0  # between two plain lines
+_PLAIN = "{desc}: {n_fmt} of {total_fmt}{unit}, {elapsed} so far, about {remaining} left{postfix}"
+
+
+class Progress(tqdm):
+    """A `tqdm` that writes a line now and then, without control characters, off a terminal."""
+
+    def __init__(self, *args: Any, **options: Any):
+        stream = options.setdefault("file", sys.stderr)
+        if not _is_terminal(stream):
+            options |= {"file": _Lines(stream), "mininterval": _SECONDS, "maxinterval": _SECONDS}
+            # Of a total that is not known, tqdm's own words say all there is to say.
+            if _total(args, options) is not None:
+                options["bar_format"] = _PLAIN
+                options.setdefault("unit", "")
+        super().__init__(*args, **options)
+
+
+class _Lines:
+    """A stream that gets whole lines alone, of what was meant to write over itself."""
+
+    def __init__(self, stream: Any):
+        self._stream = stream
+
+    def write(self, text: str) -> None:
+        if text.strip():
+            self._stream.write(text.strip() + "\n")
+            self._stream.flush()
+
+    def flush(self) -> None:
+        self._stream.flush()
+
+
+def _is_terminal(stream: Any) -> bool:
+    return bool(getattr(stream, "isatty", lambda: False)())
+
+
+def _total(args: tuple, options: dict[str, Any]) -> int | None:
+    if options.get("total") is not None:
+        return options["total"]
+    iterable = args[0] if args else options.get("iterable")
+    return len(iterable) if hasattr(iterable, "__len__") else None
