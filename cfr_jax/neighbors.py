@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
-from scipy.spatial import cKDTree
 
 _BLOCK = 1 << 16  # distances held at a time: they stay in a core's cache
 _WORD = 32
@@ -230,6 +229,9 @@ def _among_all(points, k):
 def _in_tree(points, k, workers):
     """The same by a KD-tree, some rows at a time: what it finds is many times what is kept."""
     n = len(points)
+    # imported here: a fifth of a second that small clouds need not wait for
+    from scipy.spatial import cKDTree
+
     tree = cKDTree(points)
     keys = np.empty((n, k), np.int64)
     for rows in np.array_split(np.arange(n), -(-n // _TREE_ROWS)):

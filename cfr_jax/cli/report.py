@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from cfr_jax import __version__
 from cfr_jax.alignment import Alignment, align
@@ -92,7 +91,9 @@ def as_text(result: Result) -> str:
     """The transform and its quality, for people."""
     found = result.alignment
     rotation, translation = found.transform[:3, :3], found.transform[:3, 3]
-    angle = np.degrees(Rotation.from_matrix(rotation).magnitude())
+    # by the chord |R - 1|: scipy's rotations take a twelfth of the command's time to import
+    chord = np.linalg.norm(rotation - np.eye(3))
+    angle = np.degrees(2 * np.arcsin(min(chord / 8**0.5, 1.0)))
     verdict = "trusted" if found.trusted else "not trusted"
     if not found.determined:
         verdict += ", not determined"
