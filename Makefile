@@ -4,11 +4,12 @@
 #   make lint       ruff and mypy
 #   make coverage   the tests, and how much of the package they reach
 #   make bench      measure speed
+#   make docs       the site, into out/docs
 
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
-.PHONY: demo test test-slow lint format coverage bench clean
+.PHONY: demo test test-slow lint format coverage bench docs clean
 
 PYTHON ?=
 BIN := .venv/bin
@@ -37,6 +38,10 @@ format: .venv/.dev
 
 bench: .venv/.dev
 	$(BIN)/python benchmarks/speed.py
+
+docs: .venv/.dev
+	$(BIN)/python -m sphinx -b html -W --keep-going -q docs out/docs
+	@echo "wrote out/docs/index.html"
 
 clean:
 	rm -rf .venv out build dist .coverage .pytest_cache .ruff_cache .mypy_cache

@@ -92,10 +92,10 @@ def align(
 ) -> Alignment:
     """Finds the rigid motion that lays `source` on `target`.
 
-    Clouds are (n, 3) arrays, (n, 6) with normals, paths, or whatever `io.as_point_cloud` takes. They are
-    centered and scaled in float64, thinned to `max_points` each (default 1,024; `seed` says which),
-    given normals where they have none, registered by the network with `params` (default: the
-    weights that ship) and refined (`refinement.refine`; off with `refine=False`).
+    Clouds are (n, 3) arrays, (n, 6) with normals, paths, or what else `io.as_point_cloud` takes.
+    They are centered and scaled in float64, thinned to `max_points` each (default 1,024; `seed`
+    says which), given normals where they have none, registered by the network with `params`
+    (default: the weights that ship) and refined (`refinement.refine`; off with `refine=False`).
 
     `initial` (4, 4) moves the source close to the target first; without it the centroids are laid
     on each other. The network is trained for up to 45 degrees about each axis from there. The same

@@ -22,7 +22,7 @@ LAYERS = (
     ("registration", "refinement"),
     ("rpmnet",),
     ("quality",),
-    ("losses", "metrics", "weights", "progress", "cards"),
+    ("losses", "metrics", "weights", "progress", "cards", "export"),
     ("convert",),
     ("training",),
     ("checkpoints",),

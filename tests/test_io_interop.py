@@ -25,7 +25,7 @@ def message(columns, *, height=1, bigendian=False, padding=5, row_padding=0, kin
     """A PointCloud2 as a driver would fill it: fields at odd offsets, rows padded."""
     order = ">" if bigendian else "<"
     fields, at = [], 3
-    for name, (datatype, values) in columns.items():
+    for name, (datatype, _) in columns.items():
         fields.append(SimpleNamespace(name=name, offset=at, datatype=datatype, count=1))
         at += np.dtype(NUMPY[datatype]).itemsize
     layout = np.dtype(

@@ -12,9 +12,31 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from cfr_jax import __version__
-from cfr_jax.cli import batch, completion, convert, data, demo, models, register, reproduce, view
+from cfr_jax.cli import (
+    batch,
+    completion,
+    convert,
+    data,
+    demo,
+    export,
+    models,
+    register,
+    reproduce,
+    view,
+)
 
-_COMMANDS = (register, batch, view, demo, models, reproduce, convert, data, completion)
+_COMMANDS = (
+    register,
+    batch,
+    view,
+    demo,
+    models,
+    reproduce,
+    export,
+    convert,
+    data,
+    completion,
+)
 
 _DESCRIPTION = """\
 Registers 3D point clouds: finds the rigid motion that lays one cloud on another.

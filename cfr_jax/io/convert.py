@@ -1,7 +1,7 @@
 """Whatever holds points, as a `PointCloud`.
 
-Other libraries' objects are told by the module of their class, and ROS messages by their members, so
-that none of them is imported here.
+Other libraries' objects are told by the module of their class, and ROS messages by their members,
+so that none of them is imported here.
 """
 
 from __future__ import annotations

@@ -1,0 +1,198 @@
+"""Every code block of the README and of the docs runs, or says why it does not.
+
+Python blocks of a page run one after the other, in a process of their own and in a folder with two
+sample files. `cfr …` lines of shell blocks run there, too. Other commands are not run: the file,
+the target of make, or the extra that they name must exist. `<!-- not run: WHY -->` before a block
+leaves it out; its `cfr` lines must still parse, and the blocks left out are counted here.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import pytest
+
+from cfr_jax import cli, io
+
+ROOT = Path(__file__).parents[1]
+DEMO = ROOT / "cfr_jax" / "demo"
+PAGES = {
+    path.name: path
+    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
+}
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
+    "optional-dependencies"
+]
+# Commands that are parsed and not run: they need what a test does not have, or take too long.
+ONLY_PARSED = {"data", "convert", "export", "batch", "models", "reproduce", "completion"}
+# Blocks marked `not run`, by page: whoever adds one has to say so here.
+LEFT_OUT = {"recipes.md": 1, "notebooks.md": 1}
+
+BLOCK = re.compile(
+    r"(?P<mark><!-- not run: [^>]+ -->\n)?^```(?P<language>[^\n`]*)\n(?P<text>.*?)^```$",
+    re.DOTALL | re.MULTILINE,
+)
+
+
+@dataclass(frozen=True)
+class Block:
+    language: str
+    text: str
+    left_out: bool
+
+
+def blocks_of(path: Path, *languages: str) -> list[Block]:
+    found = [
+        Block(match["language"].strip(), match["text"], match["mark"] is not None)
+        for match in BLOCK.finditer(path.read_text("utf-8"))
+    ]
+    return [block for block in found if block.language in languages]
+
+
+def commands_in(block: Block) -> list[list[str]]:
+    """The command lines of a shell block, without prompts, comments, and what follows a pipe."""
+    lines = block.text.replace("\\\n", " ").splitlines()
+    if block.language == "console":
+        lines = [line[2:] for line in lines if line.startswith("$ ")]
+    commands = []
+    for line in lines:
+        words = shlex.split(line, comments=True)
+        ends = [k for k, word in enumerate(words) if word in ("|", "&&", "||", ">", "2>")]
+        words = words[: min(ends, default=len(words))]
+        if words:
+            commands.append(words)
+    return commands
+
+
+def shell_blocks(path: Path) -> list[Block]:
+    """Shell blocks: those that say so, and those without a language that hold commands."""
+    known = ("cfr ", "pip ", "make ", "python ")
+    return [
+        block
+        for block in blocks_of(path, "sh", "bash", "console", "")
+        if block.language or block.text.startswith(known)
+    ]
+
+
+@pytest.fixture
+def samples(tmp_path) -> Path:
+    """A folder with the files that the pages speak of."""
+    shutil.copy(DEMO / "source.ply", tmp_path / "source.ply")
+    io.write(tmp_path / "target.pcd", io.read(DEMO / "target.ply"))
+    return tmp_path
+
+
+def with_blocks(select) -> list[str]:
+    return [name for name, path in PAGES.items() if any(not b.left_out for b in select(path))]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", with_blocks(lambda path: blocks_of(path, "python")))
+def test_the_python_of_a_page_runs_from_top_to_bottom(name, samples):
+    # given
+    blocks = [b for b in blocks_of(PAGES[name], "python") if not b.left_out]
+    program = "\n\n".join(block.text for block in blocks)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "MPLBACKEND": "agg",
+        "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+
+    # when
+    child = subprocess.run(
+        [sys.executable, "-c", program], cwd=samples, env=environment, capture_output=True,
+        text=True,
+    )  # fmt: skip
+
+    # then
+    assert child.returncode == 0, child.stderr[-3000:]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", with_blocks(shell_blocks))
+def test_the_cfr_commands_of_a_page_run(name, samples, monkeypatch):
+    pytest.importorskip("matplotlib", reason="pages draw pictures")
+    monkeypatch.chdir(samples)
+    # what the README calls its files
+    for own, called in (("source.ply", "a.ply"), ("target.pcd", "b.pcd")):
+        shutil.copy(own, called)
+    for block in shell_blocks(PAGES[name]):
+        for command in commands_in(block):
+            if command[0] == "cfr" and not block.left_out and command[1] not in ONLY_PARSED:
+                assert cli.main(command[1:]) in (0, 3), command
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_every_command_of_a_page_names_what_there_is(name):
+    for block in shell_blocks(PAGES[name]):
+        for command in commands_in(block):
+            assert names_what_there_is(command), f"{name}: {shlex.join(command)}"
+
+
+def names_what_there_is(command: list[str]) -> bool:
+    words = [word for word in command if "=" not in word or word.startswith("-")]
+    match words:
+        case ["cfr", "--help" | "--version" | "COMMAND", *_]:
+            return True
+        case ["cfr", *rest]:
+            return parses(rest)
+        case ["make", *targets]:
+            known = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
+            return set(targets) <= set(known)
+        case ["pip", "install", *what]:
+            ours = [word for word in what if word.startswith((".", "cfr_jax"))]
+            extras = re.findall(r"[\w-]+", " ".join(re.findall(r"\[(.*?)\]", " ".join(ours))))
+            return set(extras) <= set(EXTRAS)
+        case ["python" | "python3", "-m", "cfr_jax", *rest]:
+            return parses(rest)
+        case ["python" | "python3", file, *_]:
+            return (ROOT / file).is_file()
+        case ["jupyter", "lab", file]:
+            return (ROOT / file).is_file()
+        case _:
+            return False
+
+
+def parses(arguments: list[str]) -> bool:
+    try:
+        cli._parser().parse_args(arguments)
+    except SystemExit as stop:
+        return not stop.code
+    return True
+
+
+def test_blocks_that_are_left_out_are_counted():
+    counted = {
+        name: sum(b.left_out for b in blocks_of(path, "python", "sh", "bash", "console", ""))
+        for name, path in PAGES.items()
+    }
+    assert {name: count for name, count in counted.items() if count} == LEFT_OUT
+
+
+def test_a_mark_belongs_to_a_block():
+    for name, path in PAGES.items():
+        text = path.read_text("utf-8")
+        marks = text.count("<!-- not run:")
+        assert marks == sum(m["mark"] is not None for m in BLOCK.finditer(text)), name
+
+
+def test_the_reader_of_blocks_sees_prompts_comments_pipes_and_continuations():
+    text = "```console\n$ cfr a \\\n  --b 'c d'  # why\nits answer\n$ cfr e | jq .\n```\n"
+    [match] = BLOCK.finditer(text)
+    block = Block(match["language"], match["text"], False)
+    assert commands_in(block) == [["cfr", "a", "--b", "c d"], ["cfr", "e"]]
+    assert not names_what_there_is(["cfr", "register", "a", "b", "--no-such-option"])
+    assert not names_what_there_is(["make", "coffee"])
+    assert not names_what_there_is(["pip", "install", ".[no-such-extra]"])
+    assert not names_what_there_is(["python", "missing.py"])
