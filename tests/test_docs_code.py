@@ -166,7 +166,7 @@ def names_what_there_is(command: list[str]) -> bool:
 
 def parses(arguments: list[str]) -> bool:
     try:
-        cli._parser().parse_args(arguments)
+        cli.make_parser().parse_args(arguments)
     except SystemExit as stop:
         return not stop.code
     return True
