@@ -120,6 +120,8 @@ def _records(path: Path) -> Iterator[dict[str, Any]]:
                 if not isinstance(record, dict) or (number > 1 and "source" not in record):
                     raise ValueError("it is no record of a pair")
             except ValueError as error:
+                if number == 1:
+                    return
                 raise ValueError(
                     f"{path}, line {number} is damaged ({error}): remove the line"
                 ) from None

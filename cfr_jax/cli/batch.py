@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     from cfr_jax.weights import DEFAULT, read_weights
 
     keep_compiled_programs()
-    weights = read_weights(DEFAULT if args.weights is None else args.weights)
+    weights = read_weights(DEFAULT if args.weights is None else args.weights, "cfr")
     made_with = {
         "weights": weights.sha256,
         "refine": not args.no_refine,

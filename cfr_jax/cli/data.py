@@ -44,8 +44,8 @@ CREDITS.md is written beside the files, keep it there.
 """
 
 _INFO = """\
-What a corpus holds: shapes by category, points a shape. FILE is an HDF5 file in the layout of
-modelnet40_ply_hdf5_2048, or a folder of them.
+What FILE is, told by its layout, and what a corpus holds: shapes by category, points a shape. A
+corpus is an HDF5 file in the layout of modelnet40_ply_hdf5_2048, or a folder of them.
 """
 
 
@@ -99,7 +99,9 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "info", help="what a corpus holds", description=_INFO, **style
     )  # fmt: skip
     info.set_defaults(run=_info)
-    info.add_argument("file", metavar="FILE", type=Path, help="corpus, or folder of one")
+    info.add_argument(
+        "file", metavar="FILE", type=Path, help="any data: a corpus, pairs, scans, clouds, meshes"
+    )
     info.add_argument(
         "--sheet", metavar="FILE.png", type=Path, help="a picture with shapes of every category"
     )
@@ -158,7 +160,13 @@ def _info(args: argparse.Namespace) -> int:
             raise ValueError('--sheet: pictures need matplotlib: pip install "cfr_jax[viz]"')
 
     from cfr_jax.data.corpus import read_corpus
+    from cfr_jax.data.layout import recognize
 
+    if args.file.exists() and (layout := recognize(args.file)).kind not in ("corpus", "modelnet40"):
+        if args.sheet is not None:
+            raise ValueError(f"--sheet: {layout}, wanted a corpus of shapes")
+        print(layout)
+        return 0
     corpus = read_corpus(args.file)
     counts = Counter(corpus.categories[label] for label in corpus.labels)
     print(f"{args.file}: {len(corpus)} shapes of {corpus.points.shape[1]} points")

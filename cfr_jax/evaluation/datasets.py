@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from cfr_jax.data import kitti, protocol
 from cfr_jax.data.corpus import Corpus, read_corpus
+from cfr_jax.data.layout import recognize
 from cfr_jax.data.modelnet import read_modelnet40
 from cfr_jax.data.pairs import Pair, open_pairs
 
@@ -20,25 +21,58 @@ _PROTOCOLS = {
     for made in (protocol.clean, protocol.noise, protocol.partial, protocol.low_overlap)
 }
 Make = Callable[[int], Pair]
+# What `data.layout` recognizes, as the kinds of a config, and a config that has all their settings.
+_RECOGNIZED = {
+    "corpus": "corpus",
+    "modelnet40": "modelnet40",
+    "kitti": "kitti",
+    "pair-list": "pairs",
+    "pair-file": "pairs",
+}
+_CONFIGS = {
+    "corpus": "eval_open_cad.py",
+    "modelnet40": "eval_modelnet40.py",
+    "kitti": "eval_scans_lidar.py",
+    "pairs": "eval_scans_rgbd.py",
+}
 
 
 def read_pairs(data: Any, limit: int, cache: Path) -> list[Pair]:
     """The first `limit` pairs (0: all) of the `data` section of a config, all of them with truth.
 
-    `data.kind` is "corpus", "modelnet40", "kitti", or "pairs", and `data.path` a file or folder.
-    Scans have their refined truths kept in the folder `cache`. Raises ValueError where data is
-    missing, with what the folder should hold, and for a pair without a truth.
+    `data.kind` is "corpus", "modelnet40", "kitti", or "pairs", or "auto" to have it told from the
+    layout of `data.path`, a file or folder. Scans have their refined truths kept in the folder
+    `cache`. Raises ValueError where data is missing, with what the folder should hold, and for a
+    pair without a truth.
     """
     kinds = {"corpus": _corpus, "modelnet40": _modelnet40, "kitti": _kitti, "pairs": _pairs}
-    if data.kind not in kinds:
-        raise ValueError(f"data.kind is {data.kind!r}, wanted one of {', '.join(kinds)}")
+    if data.kind not in (*kinds, "auto"):
+        raise ValueError(f"data.kind is {data.kind!r}, wanted auto or one of {', '.join(kinds)}")
     if limit < 0:
         raise ValueError(f"limit is {limit}, wanted 0 for all pairs, or how many")
-    count, make = kinds[data.kind](data, cache)
+    kind = _recognized(data.path) if data.kind == "auto" else data.kind
+    try:
+        count, make = kinds[kind](data, cache)
+    except AttributeError as error:  # of the config
+        raise ValueError(
+            f"data lacks a setting that {kind} data need ({error}); a config of such data is "
+            f"configs/{_CONFIGS[kind]}"
+        ) from None
     count = min(limit or count, count)
     if not count:
         raise ValueError(f"data: no pair in {data.path}")
     return [_checked(make(i)) for i in tqdm(range(count), "making pairs", disable=None)]
+
+
+def _recognized(path: str | Path) -> str:
+    layout = recognize(path)
+    if layout.kind not in _RECOGNIZED:
+        raise ValueError(
+            f"data.path: {layout}, which have no truth to measure against; wanted a list of pairs "
+            "with their transforms, or a corpus (`cfr data build` makes one of meshes)"
+        )
+    print(f"recognized  {layout}")
+    return _RECOGNIZED[layout.kind]
 
 
 def _corpus(data: Any, cache: Path) -> tuple[int, Make]:

@@ -68,6 +68,8 @@ def read(path: str | os.PathLike[str], *, samples: int | None = None, seed: int 
     path = Path(path)
     suffix = path.suffix.lower()
     try:
+        if path.is_dir():
+            raise CloudFileError("is a folder, wanted a file")
         parse = _chosen(_READERS, suffix)
         data = _contents(path)
         place = (path.parent,) if suffix in _NEEDS_FOLDER else ()
@@ -112,8 +114,6 @@ def _chosen(formats: dict[str, Callable], suffix: str) -> Callable:
 def _contents(path: Path) -> bytes:
     try:
         mode = path.stat().st_mode
-        if stat.S_ISDIR(mode):
-            raise CloudFileError("is a folder, wanted a file")
         if not stat.S_ISREG(mode):  # reading a pipe or a device may never end
             raise CloudFileError("is not a regular file")
         data = path.read_bytes()
