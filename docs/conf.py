@@ -32,6 +32,15 @@ python_use_unqualified_type_names = True
 
 def setup(app):
     app.connect("autodoc-process-docstring", bars_stay_bars)
+    app.connect("source-read", list_the_other_pages)
+
+
+def list_the_other_pages(app, name, source):
+    """A page that the index does not name is listed by it all the same."""
+    if name == "index":
+        named = {line.strip() for line in source[0].splitlines()} | {"index"}
+        others = "\n".join(sorted(app.env.found_docs - named))
+        source[0] = source[0].replace("(the other pages)", others)
 
 
 def bars_stay_bars(app, what, name, obj, options, lines):

@@ -33,7 +33,7 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
     "optional-dependencies"
 ]
 # Commands that are parsed and not run: they need what a test does not have, or take too long.
-ONLY_PARSED = {"data", "convert", "export", "batch", "models", "reproduce", "completion"}
+ONLY_PARSED = {"data", "convert", "reproduce", "completion"}
 # Blocks marked `not run`, by page: whoever adds one has to say so here.
 LEFT_OUT = {"recipes.md": 1, "notebooks.md": 1}
 
@@ -88,7 +88,23 @@ def samples(tmp_path) -> Path:
     """A folder with the files that the pages speak of."""
     shutil.copy(DEMO / "source.ply", tmp_path / "source.ply")
     io.write(tmp_path / "target.pcd", io.read(DEMO / "target.ply"))
+    # what the README calls them
+    for own, called in (("source.ply", "a.ply"), ("target.pcd", "b.pcd")):
+        shutil.copy(tmp_path / own, tmp_path / called)
+    (tmp_path / "pairs.csv").write_text("source.ply,target.pcd\na.ply,b.pcd\n")
+    (tmp_path / "scans").mkdir()
+    shutil.copy(DEMO / "source.ply", tmp_path / "scans" / "one.ply")
     return tmp_path
+
+
+def commands_in_tables(path: Path) -> list[list[str]]:
+    """The `cfr …` commands in the cells of a page's tables."""
+    return [
+        shlex.split(command)
+        for line in path.read_text("utf-8").splitlines()
+        if line.startswith("|")
+        for command in re.findall(r"`(cfr \w+ [^`…]+)`", line)
+    ]
 
 
 def with_blocks(select) -> list[str]:
@@ -124,19 +140,30 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(name, samples):
 def test_the_cfr_commands_of_a_page_run(name, samples, monkeypatch):
     pytest.importorskip("matplotlib", reason="pages draw pictures")
     monkeypatch.chdir(samples)
-    # what the README calls its files
-    for own, called in (("source.ply", "a.ply"), ("target.pcd", "b.pcd")):
-        shutil.copy(own, called)
     for block in shell_blocks(PAGES[name]):
-        for command in commands_in(block):
-            if command[0] == "cfr" and not block.left_out and command[1] not in ONLY_PARSED:
-                assert cli.main(command[1:]) in (0, 3), command
+        for command in [] if block.left_out else commands_in(block):
+            run(command)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in PAGES if commands_in_tables(PAGES[name])])
+def test_the_cfr_commands_in_the_tables_of_a_page_run(name, samples, monkeypatch):
+    monkeypatch.chdir(samples)
+    pytest.importorskip("matplotlib", reason="pages draw pictures")
+    for command in commands_in_tables(PAGES[name]):
+        run(command)
+
+
+def run(command: list[str]) -> None:
+    if command[0] == "cfr" and command[1] not in ONLY_PARSED:
+        assert cli.main(command[1:]) in (0, 3), shlex.join(command)  # 3: not trusted, with --strict
 
 
 @pytest.mark.parametrize("name", PAGES)
 def test_every_command_of_a_page_names_what_there_is(name):
-    for block in shell_blocks(PAGES[name]):
-        for command in commands_in(block):
+    blocks = [commands_in(block) for block in shell_blocks(PAGES[name])]
+    for commands in [*blocks, commands_in_tables(PAGES[name])]:
+        for command in commands:
             assert names_what_there_is(command), f"{name}: {shlex.join(command)}"
 
 

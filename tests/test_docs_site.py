@@ -72,4 +72,4 @@ def test_the_answers_to_what_users_ask_are_all_there():
     assert len(rows) == 12
     for row in rows:
         shown = row.rstrip("| ").rpartition("|")[2]
-        assert re.search(r"`cfr |\]\(", shown), row
+        assert re.fullmatch(r" `cfr [^`]+`", shown), row
