@@ -236,15 +236,19 @@ def iterate(
         transform = rigid.fit_rigid(source.points, found.targets, found.weights)
         yield Step(transform, found, affinity)
         motion = lax.stop_gradient(transform) if settings.detach_motion else transform
-        moved = source.replace(
-            points=rigid.apply(motion, source.points), normals=rigid.rotate(motion, source.normals)
-        )
+        moved = moved_by(motion, source)
 
 
 def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> Iterator[Step]:
     """The iterations that the parameters were made for, both clouds given as they are."""
     reference = _encode(params, target, settings=settings)
     return iterate(params, source, reference, iterations_of(params), settings)
+
+
+def moved_by(motion: Float[Array, "4 4"], cloud: Cloud) -> Cloud:
+    """The cloud elsewhere: points moved, normals turned."""
+    points, normals = rigid.apply(motion, cloud.points), rigid.rotate(motion, cloud.normals)
+    return Cloud(points, normals, cloud.neighbors, cloud.mask)
 
 
 def iterations_of(params: dict) -> int:

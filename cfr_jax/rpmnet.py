@@ -22,7 +22,7 @@ from cfr_jax.features import raw_features
 from cfr_jax.layers import apply_layer
 from cfr_jax.neighbors import first_in_ball
 from cfr_jax.network import GROUPS, AnnealingNet, kernel_init, layer_of, unit_rows
-from cfr_jax.registration import Cloud, Step
+from cfr_jax.registration import Cloud, Step, moved_by
 from cfr_jax.sinkhorn import Affinity, match
 
 _WIDTHS = (96, 96, 192)
@@ -104,10 +104,7 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> It
         )
         transform = rigid.fit_rigid(source.points, found.targets, found.weights)
         yield Step(transform, found, affinity)
-        motion = lax.stop_gradient(transform)
-        moved = source.replace(
-            points=rigid.apply(motion, source.points), normals=rigid.rotate(motion, source.normals)
-        )
+        moved = moved_by(lax.stop_gradient(transform), source)
 
 
 def bind(params: dict) -> RPMNet:

@@ -568,7 +568,7 @@ def test_weights_that_are_not_there_leave_their_method_out_and_no_other(tmp_path
             },
         }
     )
-    rpmnet, mine, cfr = methods_of(config, [], seed=0)
+    rpmnet, mine, cfr = methods_of(config, ["rpmnet", "mine", "cfr"], seed=0)
     assert "nowhere.safetensors" in rpmnet.missing and "nobody" in mine.missing
     assert cfr.missing is None
     held = run_method(mine, [a_pair()], tmp_path / "part.json", timeout=1.0)
