@@ -13,7 +13,8 @@ def get_config() -> ConfigDict:
     config.settings = ConfigDict()  # fields of `registration.Settings` other than the paper's
 
     config.data = ConfigDict()
-    config.data.train = "../shared/data/open_cad/train.h5"  # any file in the ModelNet40 layout
+    # any file in the ModelNet40 layout, or sources by name, as in scans.py
+    config.data.train = "../shared/data/open_cad/train.h5"
     config.data.validation = "../shared/data/open_cad/val.h5"
 
     # Clouds grow as training goes on: small ones learn the most per second at first, and the
@@ -29,20 +30,31 @@ def get_config() -> ConfigDict:
     config.sampling.translation = 0.5
     config.sampling.any_orientation = 0.3  # of the shapes; the rest stand upright, as CAD models do
     config.sampling.scale = (0.8, 1.2)
+    config.sampling.uneven = 0.0  # of the pairs: clouds denser on one side, `density` times
+    config.sampling.density = (3.0, 10.0)
+    config.sampling.outliers = (0.0, 0.0)  # share of the points
+    config.sampling.noise = (0.01, 0.01)  # per axis
+    config.sampling.sensor_noise = 0.0  # of the pairs: along the rays of a depth sensor instead
     config.sampling.estimated_normals = 0.4
 
     config.train = ConfigDict()
+    config.train.optimizer = "adamw"  # or adam, lion, sgd
+    config.train.schedule = "cosine"  # or wsd (warm-up, stable, decay), constant
     config.train.peak_rate = 1e-3
     config.train.warmup = 0.1  # share of all steps
+    config.train.cooldown = 0.2  # the same, of wsd alone
     config.train.clip = 1.0
     config.train.weight_decay = 1e-5
     config.train.correspondence_weight = 0.05
     config.train.average_decay = 0.999
-    config.train.pairs_at_once = 1  # on an accelerator: the batch
+    config.train.precision = "float32"  # of the MLPs' products: or tensorfloat32, bfloat16 (GPU, TPU)
+    config.train.pairs_at_once = 1  # on an accelerator: as many as fit; their gradients are summed
+    config.train.max_skipped = 20  # steps in a row whose gradient is not finite, before it stops
     config.train.workers = 1
     config.train.start_from = ""  # weights to go on from, instead of fresh ones
 
     config.log_every = 50  # steps
+    config.checkpoint_every = 250
     config.validate_every = 500
     # all of val.h5: on 96, two flipped shapes decided which weights were best
     config.validation_pairs = 465

@@ -27,7 +27,8 @@ def pytest_configure(config):
 def pytest_sessionstart():
     # The fields of a result state the shapes of one pair. Coming out of vmap or a scan it is made
     # anew, with one more axis in front or with placeholders, and that is no mistake.
-    from cfr_jax import confidence, losses, quality, registration, sinkhorn, solving, training
+    from cfr_jax import confidence, losses, quality, registration, sinkhorn, solving
+    from cfr_jax.training.step import TrainState
 
     for kind in (
         registration.Cloud,
@@ -38,7 +39,7 @@ def pytest_sessionstart():
         confidence.Clues,
         solving.Found,
         losses.PairLoss,
-        training.TrainState,
+        TrainState,
     ):
         typing.no_type_check(kind.__init__)
 

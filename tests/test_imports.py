@@ -24,12 +24,11 @@ LAYERS = (
     ("quality",),
     ("losses", "metrics", "weights", "progress", "cards", "export"),
     ("convert",),
-    ("training",),
-    ("checkpoints",),
     ("io",),
     ("data", "viewer"),
-    ("trainer", "baselines"),
+    ("baselines",),
     ("preparation", "confidence"),
+    ("training",),
     ("planning",),
     ("solving", "doubts"),
     ("alignment",),
@@ -134,7 +133,7 @@ from cfr_jax.data.corpus import Corpus
 from .cloud import PointCloud
 from .. import losses
 def inside():
-    from cfr_jax import trainer as t
+    from cfr_jax import metrics as t
 """
 
     # when
@@ -147,7 +146,7 @@ def inside():
         "cfr_jax.data.corpus.Corpus",
         "cfr_jax.io.cloud.PointCloud",
         "cfr_jax.losses",
-        "cfr_jax.trainer",
+        "cfr_jax.metrics",
     }
 
 

@@ -122,6 +122,16 @@ class Hdf5Pairs(PairFile):
         if not self.names:
             raise ValueError(f"{self.path} holds no group; wanted one a pair: source, target, ...")
 
+    def frames(self, index: int) -> tuple[str | int, str | int]:
+        """What the source and the target of a pair were recorded from: the numbers
+        `source_frame` and `target_frame` of the group, or names of this pair's own."""
+        name = self.names[index]
+        with h5py.File(self.path, "r") as file:
+            said = file[name].attrs
+            if "source_frame" in said and "target_frame" in said:
+                return int(said["source_frame"]), int(said["target_frame"])
+        return f"{name}/source", f"{name}/target"
+
     def _read(self, index: int) -> Pair:
         name = self.names[index]
         where = f"{self.path}, {name}"

@@ -1,0 +1,163 @@
+"""Checkpoints of a training: whole or not there, checked before they are used.
+
+    checkpoints/1500/state/...      what orbax wrote
+    checkpoints/1500/about.json     config, position in the data, measurements, versions
+    checkpoints/1500/manifest.json  SHA-256 of all of that
+
+A checkpoint is written in `checkpoints/.unfinished`, its manifest last, and appears by a rename:
+a process killed at any moment leaves the ones before it as they were. One that is found damaged is
+renamed to `1500.damaged`, and the newest sound one before it is used.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import warnings
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import orbax.checkpoint as ocp
+from jax.sharding import NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from cfr_jax.training import manifest
+from cfr_jax.training.devices import agree, is_first, make_mesh
+from cfr_jax.training.step import TrainState
+
+_UNFINISHED = ".unfinished"
+
+
+class SaveError(OSError):
+    """A checkpoint could not be written; says where, why, and what is left."""
+
+
+class Checkpoints:
+    """The checkpoints in a folder; leaving the context waits for the last one.
+
+    Keeps the last `keep` and the best. With several processes all have to call every method, and
+    the folder has to be one and the same for all.
+    """
+
+    def __init__(self, folder: Path, keep: int):
+        if keep < 1:
+            raise ValueError(f"keep_checkpoints: got {keep}, wanted at least 1")
+        self.folder, self._keep = Path(folder).absolute(), keep
+        self._writer = ocp.StandardCheckpointer()
+        self._thread = ThreadPoolExecutor(1)
+        self._running: Future | None = None
+        if is_first():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            shutil.rmtree(self.folder / _UNFINISHED, ignore_errors=True)
+
+    def __enter__(self) -> Checkpoints:
+        return self
+
+    def __exit__(self, kind, *_) -> None:
+        try:
+            if kind is None:
+                self.wait()
+        finally:
+            # after an error the writing goes on to its end, and what it says is of no use
+            self._thread.shutdown()
+            self._writer.close()
+
+    def steps(self) -> list[int]:
+        """The steps that there are checkpoints of, damaged or not, oldest first."""
+        return sorted(int(path.name) for path in self.folder.iterdir() if path.name.isdigit())
+
+    def save(self, state: TrainState, about: dict, best: int | None = None) -> None:
+        """Saves in the background; `about` is anything JSON holds, `best` the step to keep.
+
+        Waits for the save before. Raises `SaveError` where that could not be written.
+        """
+        self.wait()
+        step = int(state.step)
+        beside = self.folder / _UNFINISHED / str(step)
+        copy = jax.tree.map(jnp.copy, state)  # the next step donates the original
+        try:
+            if is_first():
+                beside.mkdir(parents=True)
+            self._writer.save(beside / "state", copy)
+        except (OSError, ValueError) as error:
+            self._fail(step, error)
+        self._running = self._thread.submit(self._finish, step, beside, about, best)
+
+    def wait(self) -> None:
+        """Waits until what was saved is there; raises `SaveError` where it could not be written."""
+        running, self._running = self._running, None
+        if running is not None:
+            running.result()
+
+    def restore(self, like: TrainState) -> tuple[TrainState, dict] | None:
+        """The newest sound state and what was said about it; None if nothing was ever saved.
+
+        Warns of each damaged one. Raises ValueError where all are damaged, and where the newest
+        does not fit `like`.
+        """
+        step = agree(self._newest_sound() if is_first() else 0)
+        if step < 0:
+            return None
+        folder = self.folder / str(step)
+        everywhere = NamedSharding(make_mesh(), P())
+        shapes = jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=everywhere), like
+        )
+        try:
+            state = self._writer.restore(folder / "state", shapes)
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"{folder} holds another kind of training: was the network or the optimizer changed "
+                "in the config? Take another workdir, or the config of about.json there"
+            ) from error
+        return state, json.loads((folder / "about.json").read_text("utf-8"))
+
+    def _newest_sound(self):
+        steps = self.steps()
+        for step in reversed(steps):
+            folder = self.folder / str(step)
+            try:
+                manifest.verify(folder)
+                return step
+            except manifest.Damaged as error:
+                warnings.warn(f"{error}; going back to the checkpoint before it", stacklevel=4)
+                aside = folder.with_name(f"{step}.damaged")
+                shutil.rmtree(aside, ignore_errors=True)
+                folder.rename(aside)
+        if steps:
+            raise ValueError(
+                f"no sound checkpoint in {self.folder}: {len(steps)} are damaged; "
+                "remove the folder to start anew"
+            )
+        return -1
+
+    def _finish(self, step, beside, about, best):
+        try:
+            self._writer.wait_until_finished()
+            if not is_first():
+                return
+            (beside / "about.json").write_text(json.dumps(about, indent=1), "utf-8")
+            manifest.write(beside)
+            final = self.folder / str(step)
+            shutil.rmtree(final, ignore_errors=True)
+            beside.rename(final)
+        except Exception as error:  # orbax passes on whatever its storage says
+            self._fail(step, error)
+        steps = self.steps()
+        for old in steps[: -self._keep]:
+            if old != best:
+                shutil.rmtree(self.folder / str(old))
+
+    def _fail(self, step: int, error: Any):
+        if is_first():
+            shutil.rmtree(self.folder / _UNFINISHED, ignore_errors=True)
+        left = self.steps()[-1:]
+        kept = f"the last good one is of step {left[0]}" if left else "there is none before it"
+        why = " ".join(str(error).split())
+        raise SaveError(
+            f"checkpoint of step {step} in {self.folder} could not be written; {kept}.\n"
+            f"Make room or give another --workdir, then run the same command again ({why[:300]})"
+        ) from error

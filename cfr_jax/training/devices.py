@@ -1,0 +1,89 @@
+"""The devices of a training, and how a state and a batch lie on them.
+
+Data parallel: every device holds the whole state and a share of each batch. With several processes
+(`join`) each makes and holds the shares of its own devices only.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+AXIS = "data"
+
+
+def join(coordinator: str, processes: int, process: int) -> None:
+    """Makes this process number `process` of `processes`, which find each other at `coordinator`.
+
+    Call it before anything else of JAX. Without a `coordinator` a single process stays alone.
+    Raises ValueError for numbers that do not fit, RuntimeError where the others are not found.
+    """
+    if not coordinator:
+        if processes != 1 or process != 0:
+            raise ValueError(
+                f"processes: got {processes}, wanted 1 as there is no coordinator; "
+                "give --coordinator=HOST:PORT, the same for all"
+            )
+        return
+    if not 0 <= process < processes:
+        raise ValueError(f"process: got {process}, wanted 0 to {processes - 1}")
+    jax.distributed.initialize(coordinator, num_processes=processes, process_id=process)
+
+
+def make_mesh() -> Mesh:
+    """All devices of all processes in a row."""
+    return jax.make_mesh((jax.device_count(),), (AXIS,), axis_types=(AxisType.Auto,))
+
+
+def is_first() -> bool:
+    """Whether this process is the one that writes files and speaks."""
+    return jax.process_index() == 0
+
+
+def replicate(tree: Any, mesh: Mesh) -> Any:
+    """The same values on every device; every process has to hold them."""
+    here = NamedSharding(mesh, P())
+    return jax.tree.map(
+        lambda leaf: jax.make_array_from_callback(
+            np.shape(leaf), here, lambda index: np.asarray(leaf)[index]
+        ),
+        tree,
+    )
+
+
+def share_of(size: int) -> slice:
+    """The rows of a batch of `size` pairs that this process makes."""
+    mine = size // jax.process_count()
+    return slice(jax.process_index() * mine, (jax.process_index() + 1) * mine)
+
+
+def spread(batch: dict, mesh: Mesh) -> dict:
+    """A batch over the devices; each process gives the rows that `share_of` told it."""
+    rows = NamedSharding(mesh, P(AXIS))
+    return {key: jax.make_array_from_process_local_data(rows, batch[key]) for key in batch}
+
+
+def gather(values: jax.Array) -> np.ndarray:
+    """All rows of an array that lies spread over the devices, in every process."""
+    return np.asarray(multihost_utils.process_allgather(values, tiled=True))
+
+
+def agree(number: int) -> int:
+    """What the first process says."""
+    return int(multihost_utils.broadcast_one_to_all(np.int32(number)))
+
+
+def check_batch(size: int, pairs_at_once: int, mesh: Mesh) -> None:
+    """Raises ValueError for a batch that cannot be spread evenly."""
+    share, rest = divmod(size, mesh.size)
+    if rest or not share:
+        raise ValueError(f"batch: got {size} pairs, wanted a multiple of the {mesh.size} devices")
+    if pairs_at_once < 1 or share % min(pairs_at_once, share):
+        raise ValueError(
+            f"pairs_at_once: got {pairs_at_once}, wanted a divisor of the {share} pairs of a device"
+        )

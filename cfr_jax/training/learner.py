@@ -1,0 +1,65 @@
+"""What is trained: a network by name, and the curriculum it goes through."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from typing import Any
+
+import jax
+
+from cfr_jax import network, registration, rpmnet
+from cfr_jax.training.step import Unroll
+
+
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """A network that can be trained, and how it is run in training and when it is validated."""
+
+    fresh: Callable[[jax.Array], dict]
+    unroll: Unroll
+    trained: Callable[[int], Hashable]
+    """Settings by the number of neighbors."""
+    validated: Hashable
+
+
+@dataclasses.dataclass(frozen=True)
+class Phase:
+    """A stretch of the curriculum."""
+
+    steps: int
+    points: int
+    neighbors: int
+    batch: int
+
+
+def learner(config: Any) -> Learner:
+    """The network that `config.network` names: "cfr", or "rpmnet" to compare with."""
+    if config.network == "cfr":
+        changed = dict(config.get("settings", {}))
+        return Learner(
+            fresh=lambda key: network.init_params(
+                key, config.iterations, config.get("shared", False)
+            ),
+            unroll=registration.unroll,
+            trained=lambda count: registration.Settings(
+                neighbors=count, detach_motion=True, **changed
+            ),
+            validated=registration.Settings(**changed),
+        )
+    if config.network == "rpmnet":
+        return Learner(
+            fresh=rpmnet.init_params,
+            unroll=rpmnet.unroll,
+            trained=lambda count: rpmnet.Settings(neighbors=count, iterations=config.iterations),
+            validated=rpmnet.Settings(),
+        )
+    raise ValueError(f"network: got {config.network!r}, wanted 'cfr' or 'rpmnet'")
+
+
+def remaining(phases: Sequence[Phase], step: int) -> Iterator[tuple[Phase, int]]:
+    """The phases that `step` has not finished, each with the number of its steps already done."""
+    for phase in phases:
+        if step < phase.steps:
+            yield phase, step
+        step = max(0, step - phase.steps)

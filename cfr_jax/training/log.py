@@ -1,0 +1,121 @@
+"""What a training says of itself: a progress bar for people, `metrics.jsonl` for programs."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import tqdm
+
+from cfr_jax.losses import PairLoss
+
+
+class Clock:
+    """Seconds of training, of the wall and of the processors; stopped during validations.
+
+    Goes on from what a run had used before, so that it counts all of a training. Processor seconds
+    are those of all threads of this process.
+    """
+
+    def __init__(self, seconds: float = 0.0, processor_seconds: float = 0.0):
+        self._used = np.array([seconds, processor_seconds])
+        self._since: np.ndarray | None = None
+
+    def start(self) -> None:
+        """Goes on counting."""
+        if self._since is None:
+            self._since = self._now()
+
+    def stop(self) -> None:
+        """Counts no more."""
+        self._used, self._since = self._total(), None
+
+    def read(self) -> dict[str, float]:
+        """Both counts."""
+        seconds, processor = self._total()
+        return {"seconds": float(seconds), "processor_seconds": float(processor)}
+
+    def _total(self):
+        return self._used if self._since is None else self._used + self._now() - self._since
+
+    @staticmethod
+    def _now():
+        return np.array([time.perf_counter(), time.process_time()])
+
+
+class Journal:
+    """`metrics.jsonl`: an object a line, appended; read again when a run goes on."""
+
+    def __init__(self, path: Path, step: int):
+        self.path = path
+        # what an interrupted run measured after its last checkpoint will be measured again
+        lines = [line for line in read_journal(path) if line["step"] <= step]
+        beside = path.with_name(f".{path.name}.{os.getpid()}")
+        beside.write_text("".join(json.dumps(line) + "\n" for line in lines), "utf-8")
+        os.replace(beside, path)
+
+    def write(self, line: dict) -> None:
+        """Appends one line."""
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+def read_journal(path: Path) -> list[dict]:
+    """The lines of a `metrics.jsonl`; one that a crash left unfinished is passed over."""
+    lines = []
+    for text in path.read_text("utf-8").splitlines() if path.exists() else ():
+        try:
+            lines.append(json.loads(text))
+        except ValueError:
+            continue
+    return lines
+
+
+def summarize(measured: list[PairLoss]) -> dict[str, Any]:
+    """Means over the pairs of several steps; alpha and beta per iteration."""
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves).mean(axis=0), *measured)
+    return {
+        "loss": float(joined.total),
+        "pose": float(joined.pose),
+        "correspondence": float(joined.correspondence),
+        "rotation_error": joined.rotation_error.tolist(),
+        "translation_error": joined.translation_error.tolist(),
+        "beta": joined.beta.tolist(),
+        "alpha": joined.alpha.tolist(),
+    }
+
+
+class Bar:
+    """Loss, errors, steps per second and the time left, on standard error."""
+
+    def __init__(self, total: int, step: int, shown: bool):
+        self._bar = tqdm.tqdm(
+            total=total, initial=step, unit="step", mininterval=5, disable=not shown
+        )
+
+    def step(self, step: int) -> None:
+        """Steps done so far."""
+        self._bar.update(step - self._bar.n)
+
+    def measured(self, line: dict) -> None:
+        """Shows the newest means: rotation error in degrees, translation error in radii."""
+        self._bar.set_postfix(
+            loss=f"{line['loss']:.3f}",
+            RE=f"{line['rotation_error'][-1]:.1f}",
+            TE=f"{line['translation_error'][-1]:.3f}",
+            refresh=False,
+        )
+
+    def say(self, text: str) -> None:
+        """A line above the bar."""
+        if not self._bar.disable:
+            self._bar.write(text)
+
+    def close(self) -> None:
+        """Ends the bar."""
+        self._bar.close()

@@ -1,0 +1,60 @@
+"""SHA-256 of every file of a folder, so that a flipped bit or a lost file is seen and named.
+
+Orbax reads an array file with a flipped bit as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+NAME = "manifest.json"
+
+
+class Damaged(ValueError):
+    """A folder whose content is not what was written; says which file."""
+
+
+def write(folder: Path) -> None:
+    """Writes the manifest of all that is in `folder` now."""
+    (folder / NAME).write_bytes(_text(_files(folder)))
+
+
+def verify(folder: Path) -> None:
+    """Raises `Damaged` unless `folder` holds what its manifest says, no less and no more."""
+    try:
+        told = (folder / NAME).read_bytes()
+    except FileNotFoundError as error:
+        raise Damaged(f"{folder} has no {NAME}: it was never finished") from error
+    try:
+        wanted = json.loads(told)["files"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise Damaged(f"{folder / NAME} cannot be read") from error
+    # byte by byte: what a flipped bit leaves readable is damage, too
+    if not isinstance(wanted, dict) or told != _text(wanted):
+        raise Damaged(f"{folder / NAME} is not as it was written")
+    found = _files(folder)
+    for name in sorted(wanted.keys() | found.keys()):
+        if name not in found:
+            raise Damaged(f"{folder / name} is missing")
+        if name not in wanted:
+            raise Damaged(f"{folder / name} does not belong there")
+        if found[name] != wanted[name]:
+            raise Damaged(f"{folder / name} is damaged: its SHA-256 is not what was written")
+
+
+def _files(folder):
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != NAME)
+    return {path.relative_to(folder).as_posix(): _digest(path) for path in paths}
+
+
+def _digest(path):
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _text(files):
+    listed = json.dumps(files, indent=1, sort_keys=True)
+    whole = {"files": files, "sha256": hashlib.sha256(listed.encode()).hexdigest()}
+    return (json.dumps(whole, indent=1, sort_keys=True) + "\n").encode()

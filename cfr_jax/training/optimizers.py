@@ -1,0 +1,66 @@
+"""Optimizers and learning rates by name, as a config asks for them."""
+
+from __future__ import annotations
+
+import optax
+
+SCHEDULES = ("cosine", "wsd", "constant")
+OPTIMIZERS = ("adamw", "adam", "lion", "sgd")
+
+
+def make_schedule(
+    kind: str, *, peak_rate: float, steps: int, warmup: float, cooldown: float = 0.2
+) -> optax.Schedule:
+    """The learning rate over `steps` steps; `warmup` and `cooldown` are shares of them.
+
+    Every one starts at a 25th of the peak and rises over the warm-up. Then "cosine" falls to a
+    thousandth along half a wave; "wsd" (warm-up, stable, decay) stays until the cool-down and falls
+    to a thousandth in a straight line, so that a run can be made longer without starting anew;
+    "constant" stays.
+    """
+    if not steps > 0 or not peak_rate > 0:
+        raise ValueError(f"schedule: got {steps} steps at {peak_rate}, wanted both positive")
+    if not 0 <= warmup < 1 or not 0 < cooldown <= 1 - warmup:
+        raise ValueError(
+            f"schedule: got warmup {warmup} and cooldown {cooldown}, wanted shares of all steps, "
+            "together at most 1"
+        )
+    rising = max(1, int(warmup * steps))
+    start, end = peak_rate / 25, peak_rate / 1000
+    if kind == "cosine":
+        return optax.warmup_cosine_decay_schedule(start, peak_rate, rising, steps, end)
+    rise = optax.linear_schedule(start, peak_rate, rising)
+    stay = optax.constant_schedule(peak_rate)
+    if kind == "constant":
+        return optax.join_schedules([rise, stay], [rising])
+    if kind == "wsd":
+        falling = max(1, int(cooldown * steps))
+        fall = optax.linear_schedule(peak_rate, end, falling)
+        return optax.join_schedules([rise, stay, fall], [rising, max(rising, steps - falling)])
+    raise ValueError(f"schedule: got {kind!r}, wanted one of {', '.join(SCHEDULES)}")
+
+
+def make_optimizer(
+    kind: str, schedule: optax.Schedule, *, clip: float, weight_decay: float
+) -> optax.GradientTransformation:
+    """An optimizer behind a gradient clipped by global norm.
+
+    "adamw", "lion" and "sgd" (Nesterov momentum 0.9) shrink the weights apart from the gradient.
+    "adam" adds `weight_decay` times the weights to the gradient first, as the published trainings
+    did.
+    """
+    if kind == "adamw":
+        rule = optax.adamw(schedule, weight_decay=weight_decay)
+    elif kind == "adam":
+        rule = optax.chain(optax.add_decayed_weights(weight_decay), optax.adam(schedule))
+    elif kind == "lion":
+        rule = optax.lion(schedule, weight_decay=weight_decay)
+    elif kind == "sgd":
+        rule = optax.chain(
+            optax.trace(0.9, nesterov=True),
+            optax.add_decayed_weights(weight_decay),
+            optax.scale_by_learning_rate(schedule),
+        )
+    else:
+        raise ValueError(f"optimizer: got {kind!r}, wanted one of {', '.join(OPTIMIZERS)}")
+    return optax.chain(optax.clip_by_global_norm(clip), rule)

@@ -1,0 +1,171 @@
+"""The training step: pure, donated, data-parallel over the devices of a mesh."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Hashable, Iterator
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, Int
+
+from cfr_jax.losses import PairLoss, pair_loss
+from cfr_jax.normals import estimate_normals
+from cfr_jax.registration import Cloud, Step
+from cfr_jax.training.devices import AXIS
+
+Unroll = Callable[[dict, Cloud, Cloud, Hashable], Iterator[Step]]
+"""The iterations of a network on a pair: `registration.unroll`, or `rpmnet.unroll`."""
+
+# What a matrix product whose precision is not stated in the program runs at: those of the MLPs.
+# Distances, covariances, affinities and motions state theirs, and stay float32 in every case.
+# Everything is stored and accumulated in float32; a CPU computes in float32 whatever is asked for.
+PRECISIONS = {"float32": "float32", "tensorfloat32": "tensorfloat32", "bfloat16": "BF16_BF16_F32"}
+
+
+@struct.dataclass
+class TrainState:
+    """All that a step changes."""
+
+    step: Int[Array, ""]
+    params: dict
+    average: dict
+    """Exponential moving average of the parameters: what is validated and shipped."""
+    optimizer: optax.OptState
+    skipped: Int[Array, ""]
+    """Steps left out because their gradient was not finite."""
+    skipped_in_row: Int[Array, ""]
+    """How many of them came last, one after the other."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """What a step is compiled for."""
+
+    unroll: Unroll
+    settings: Hashable
+    optimizer: optax.GradientTransformation
+    mesh: Mesh
+    correspondence_weight: float = 0.05
+    average_decay: float = 0.999
+    pairs_at_once: int = 1
+    precision: str = "float32"
+
+
+def init_state(params: dict, optimizer: optax.GradientTransformation) -> TrainState:
+    """A state at step zero; the average starts as a copy, since the step donates both."""
+    return TrainState(
+        step=jnp.zeros((), jnp.int32),
+        params=params,
+        average=jax.tree.map(jnp.copy, params),
+        optimizer=optimizer.init(params),
+        skipped=jnp.zeros((), jnp.int32),
+        skipped_in_row=jnp.zeros((), jnp.int32),
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("recipe",), donate_argnames=("state",))
+def train_step(state: TrainState, batch: dict, *, recipe: Recipe) -> tuple[TrainState, PairLoss]:
+    """One step on a batch of `data.batches`, its losses and errors pair by pair.
+
+    The pairs are spread evenly over the mesh. A device accumulates the gradient of its share,
+    `pairs_at_once` pairs vectorized and the rest one after the other, so that any batch fits: on
+    CPU one at a time keeps the activations in cache and is fastest, an accelerator wants many. A
+    step whose gradient is not finite changes nothing but the counts of skipped steps.
+    """
+    with jax.default_matmul_precision(PRECISIONS[recipe.precision]):
+        gradient, measured = jax.shard_map(
+            functools.partial(_mean_gradient, recipe=recipe),
+            mesh=recipe.mesh,
+            in_specs=(P(), P(AXIS)),
+            out_specs=P(),
+            check_vma=False,  # derivatives written by hand say nothing of devices
+        )(state.params, batch)
+    sound = jnp.isfinite(optax.tree.norm(gradient))
+    gradient = jax.tree.map(lambda leaf: jnp.where(sound, leaf, 0), gradient)
+    updates, moments = recipe.optimizer.update(gradient, state.optimizer, state.params)
+    params = optax.apply_updates(state.params, updates)
+    # early in a run a long average would still be the initial weights
+    decay = jnp.minimum(recipe.average_decay, (1 + state.step) / (10 + state.step))
+    average = jax.tree.map(lambda a, p: a + (1 - decay) * (p - a), state.average, params)
+
+    def keep(new, old):
+        return jax.tree.map(lambda n, o: jnp.where(sound, n, o), new, old)
+
+    after = TrainState(
+        step=state.step + 1,
+        params=keep(params, state.params),
+        average=keep(average, state.average),
+        optimizer=keep(moments, state.optimizer),
+        skipped=state.skipped + (1 - sound),
+        skipped_in_row=jnp.where(sound, 0, state.skipped_in_row + 1),
+    )
+    return after, measured
+
+
+def _mean_gradient(params, batch, *, recipe):
+    """The gradient of the mean loss over all devices, from this device's pairs of the batch."""
+
+    def loss(params, pair):
+        source, target = (_cloud(pair, side) for side in ("source", "target"))
+        measured = pair_loss(
+            recipe.unroll(params, source, target, recipe.settings),
+            source,
+            target,
+            pair["transform"],
+            correspondence_weight=recipe.correspondence_weight,
+        )
+        return measured.total, measured
+
+    gradient_of = jax.grad(loss, has_aux=True)
+    size = len(batch["transform"])
+    at_once = min(recipe.pairs_at_once, size)
+
+    def add(total, pairs):
+        if at_once == 1:  # a batch axis of one would send XLA's products down a slower path
+            gradient, measured = gradient_of(params, jax.tree.map(lambda leaf: leaf[0], pairs))
+            measured = jax.tree.map(lambda leaf: leaf[None], measured)
+        else:
+            gradient, measured = jax.vmap(gradient_of, (None, 0))(params, pairs)
+            gradient = jax.tree.map(lambda leaf: leaf.sum(0), gradient)
+        return jax.tree.map(jnp.add, total, gradient), measured
+
+    # Gradients are summed as they come: a map differentiated as a whole would keep the activations
+    # of all its pairs.
+    chunks = jax.tree.map(lambda leaf: leaf.reshape(-1, at_once, *leaf.shape[1:]), batch)
+    total, measured = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), chunks)
+    measured = jax.tree.map(lambda leaf: leaf.reshape(size, *leaf.shape[2:]), measured)
+    count = size * jax.lax.axis_size(AXIS)
+    total = jax.lax.psum(total, AXIS)
+    measured = jax.lax.all_gather(measured, AXIS, tiled=True)
+    return jax.tree.map(lambda leaf: leaf / count, total), measured
+
+
+def _cloud(pair, side):
+    points, neighbors = pair[side], pair[f"{side}_neighbors"]
+    normals = jnp.where(
+        pair["estimate_normals"], estimate_normals(points, neighbors), pair[f"{side}_normals"]
+    )
+    return Cloud(points, normals, neighbors)
+
+
+@functools.partial(jax.jit, static_argnames=("unroll", "settings", "mesh"))
+def predict(params: dict, batch: dict, *, unroll: Unroll, settings: Hashable, mesh: Mesh) -> Array:
+    """Transforms (b, L, 4, 4) of a batch that needs no training; each device takes its share, pair
+    after pair."""
+
+    def of_pair(params, pair):
+        source, target = (_cloud(pair, side) for side in ("source", "target"))
+        return jnp.stack([step.transform for step in unroll(params, source, target, settings)])
+
+    def of_share(params, pairs):
+        return jax.lax.map(functools.partial(of_pair, params), pairs)
+
+    return jax.shard_map(
+        of_share, mesh=mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False
+    )(params, batch)

@@ -1,0 +1,42 @@
+"""Errors of the network alone on held-out pairs, at full size."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from cfr_jax import metrics
+from cfr_jax.training import devices, step
+from cfr_jax.training.learner import Learner
+
+
+def place(batch: dict, mesh: Mesh) -> dict:
+    """The pairs of `sources.fixed_pairs` over the devices, the last one repeated to fill them."""
+    count = len(batch["transform"])
+    full = -(-count // mesh.size) * mesh.size
+    rows = np.minimum(np.arange(full), count - 1)[devices.share_of(full)]
+    return devices.spread(jax.tree.map(lambda leaf: leaf[rows], batch), mesh)
+
+
+def validate(chosen: Learner, params: dict, placed: dict, truth: np.ndarray, mesh: Mesh) -> dict:
+    """Rotation (degrees) and translation errors of the last transform against `truth` (b, 4, 4),
+    their recall, and the mean rotation error of every iteration; and all transforms (b, L, 4, 4).
+    """
+    found = step.predict(
+        params, placed, unroll=chosen.unroll, settings=chosen.validated, mesh=mesh
+    )
+    transforms = devices.gather(found)[: len(truth)].astype(np.float64)
+    truth = np.asarray(truth, np.float64)
+    rotation = metrics.err_r(transforms[:, -1], truth)
+    translation = metrics.err_t(transforms[:, -1], truth)
+    return {
+        "rotation_mean": float(rotation.mean()),
+        "rotation_median": float(np.median(rotation)),
+        "translation_mean": float(translation.mean()),
+        "recall_5deg_0.1": float(metrics.recalled(rotation, translation, 5.0, 0.1).mean()),
+        "rotation_by_iteration": [
+            float(metrics.err_r(transforms[:, i], truth).mean()) for i in range(transforms.shape[1])
+        ],
+        "transforms": transforms,
+    }

@@ -1,0 +1,237 @@
+"""A whole training: it resumes bit for bit, leaves what it measured, and says why it stops."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+import training_samples as samples
+from training_samples import assert_same, config
+
+from cfr_jax import weights
+from cfr_jax.training import devices, learner, loop, step, validation
+from cfr_jax.training.checkpoints import Checkpoints, SaveError
+
+
+@pytest.fixture(scope="module")
+def corpus_file(tmp_path_factory):
+    return samples.write_corpus(tmp_path_factory.mktemp("corpus") / "ellipsoids.h5")
+
+
+class Killed(Exception):
+    """Stands for the power going off."""
+
+
+def run(given, folder):
+    with pytest.MonkeyPatch.context() as patch, jax.numpy_dtype_promotion("standard"):
+        patch.setattr(validation, "validate", samples.cheap_validation)
+        # the same optimizer compiles once
+        patch.setattr(loop.optimizers, "make_optimizer", lambda *_, **__: samples.optimizer())
+        return loop.run(given, folder)
+
+
+@pytest.fixture(scope="module")
+def whole(corpus_file, tmp_path_factory):
+    """A run that nothing disturbed: its folder and its best validation."""
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, run(config(corpus_file), folder)
+
+
+def state_of(workdir):
+    with Checkpoints(workdir / "checkpoints", keep=2) as checkpoints:
+        return checkpoints.restore(samples.fresh())[0]
+
+
+def lines_of(workdir):
+    lines = (workdir / "metrics.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines]
+
+
+@pytest.fixture
+def killed_in_step(monkeypatch):
+    """Lets the training stop dead in the step with this number; lists the steps begun."""
+
+    def arrange(number, error=Killed):
+        begun, train_step = [], step.train_step
+
+        def killed(*arguments, **named):
+            begun.append(None)
+            if len(begun) == number:
+                raise error
+            return train_step(*arguments, **named)
+
+        monkeypatch.setattr(step, "train_step", killed)
+        return begun
+
+    return arrange
+
+
+def test_an_interrupted_run_resumes_bit_for_bit(corpus_file, tmp_path, whole, killed_in_step):
+    begun = killed_in_step(11)
+    with pytest.raises(Killed):
+        run(config(corpus_file), tmp_path)
+    best = run(config(corpus_file), tmp_path)
+
+    assert len(begun) == 11 + 8  # it went on after the checkpoint of step 8
+    assert best == whole[1]
+    first, second = (state_of(folder) for folder in (whole[0], tmp_path))
+    assert int(first.step) == 16
+    assert_same(first, second)
+    files = (folder / "weights.safetensors" for folder in (whole[0], tmp_path))
+    assert_same(*(weights.load_params(file) for file in files))
+    for one, other in zip(lines_of(whole[0]), lines_of(tmp_path), strict=True):
+        assert one["step"] == other["step"]
+        assert one.get("loss") == other.get("loss")
+
+
+def test_seconds_add_up_over_restarts(corpus_file, tmp_path, killed_in_step):
+    killed_in_step(11)
+    with pytest.raises(Killed):
+        run(config(corpus_file), tmp_path)
+    before = [line["training_seconds"] for line in lines_of(tmp_path) if "loss" in line]
+    run(config(corpus_file), tmp_path)
+
+    after = [line for line in lines_of(tmp_path) if "loss" in line]
+    seconds = [line["training_seconds"] for line in after]
+    assert seconds[:2] == before[:2] and len(seconds) == 4
+    assert all(a < b for a, b in zip(seconds, seconds[1:], strict=False))
+    spent = [line["processor_seconds"] for line in after]
+    assert all(a < b for a, b in zip(spent, spent[1:], strict=False))
+
+
+def test_a_finished_run_has_nothing_left_to_do(corpus_file, whole, monkeypatch):
+    monkeypatch.delattr(step, "train_step")
+
+    assert run(config(corpus_file), whole[0]) == whole[1]
+
+
+def test_a_run_leaves_its_measurements_its_weights_and_a_page(whole):
+    folder, best = whole
+
+    lines = lines_of(folder)
+    assert [line["step"] for line in lines if "loss" in line] == [4, 8, 12, 16]
+    assert all(np.isfinite(line["loss"]) for line in lines if "loss" in line)
+    measured = {line["step"]: line["validation"] for line in lines if "validation" in line}
+    assert list(measured) == [4, 8, 12, 16]
+    assert best["rotation_mean"] == min(found["rotation_mean"] for found in measured.values())
+    made = weights.read_weights(folder / "weights.safetensors")
+    assert json.loads(made.notes["validation"]) == best
+    assert json.loads(made.notes["config"])["validate_every"] == 4
+    page = (folder / "summary.html").read_text()
+    assert f"step {best['step']}" in page and "http" not in page and page.count("<svg") == 8
+
+
+def test_a_checkpoint_says_all_that_a_run_needs(whole):
+    newest = max((whole[0] / "checkpoints").iterdir(), key=lambda path: int(path.name))
+
+    about = json.loads((newest / "about.json").read_text())
+
+    assert about["step"] == 16 and about["position"] == 32 and about["best"] == whole[1]
+    assert about["config"]["train"]["optimizer"] == "adamw"
+    assert about["versions"]["jax"] == jax.__version__
+    assert about["random_key"] == jax.random.key_data(jax.random.key(0)).tolist()
+    assert about["clock"]["seconds"] > 0 and about["clock"]["processor_seconds"] > 0
+
+
+def test_another_config_goes_on_with_a_word(corpus_file, tmp_path, killed_in_step):
+    killed_in_step(6)
+    with pytest.raises(Killed):
+        run(config(corpus_file), tmp_path)
+    changed = config(corpus_file)
+    changed.keep_checkpoints = 3
+
+    with pytest.warns(UserWarning, match="differs from the checkpoint's in keep_checkpoints"):
+        run(changed, tmp_path)
+
+    assert int(state_of(tmp_path).step) == 16
+
+
+def test_gradients_that_stay_infinite_stop_the_run(corpus_file, tmp_path, monkeypatch):
+    train_step = step.train_step
+
+    def broken_after_four(state, batch, **named):
+        if int(state.step) >= 4:
+            batch = batch | {"source": batch["source"] * np.float32("nan")}
+        return train_step(state, batch, **named)
+
+    monkeypatch.setattr(step, "train_step", broken_after_four)
+    with pytest.raises(loop.Diverged, match="last 4 of 8 steps had gradients that are not finite"):
+        run(config(corpus_file), tmp_path)
+
+    assert int(state_of(tmp_path).step) == 4
+
+
+def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monkeypatch, whole):
+    given, finish = config(corpus_file), Checkpoints._finish
+
+    def full_after_step_8(self, number, *rest):
+        if number > 8:
+            monkeypatch.setattr("cfr_jax.training.manifest.write", no_space)
+        finish(self, number, *rest)
+
+    def no_space(folder):
+        raise OSError(28, "No space left on device", str(folder))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Checkpoints, "_finish", full_after_step_8)
+        with pytest.raises(SaveError, match="step 12 .*\n?.*last good one is of step 8") as stopped:
+            run(given, tmp_path)
+    assert "No space left" in str(stopped.value) and "same command" in str(stopped.value)
+    monkeypatch.undo()
+
+    assert run(given, tmp_path) == whole[1]
+    assert_same(state_of(tmp_path), state_of(whole[0]))
+
+
+@pytest.mark.parametrize(
+    ("change", "wanted"),
+    [
+        ({"network": "dcp"}, "network: got 'dcp'"),
+        ({"train.optimizer": "adagrad"}, "optimizer: got 'adagrad'"),
+        ({"train.schedule": "step"}, "schedule: got 'step'"),
+        ({"train.precision": "float16"}, "precision: got 'float16'"),
+        ({"train.pairs_at_once": 3}, "pairs_at_once: got 3|wanted a divisor"),
+        ({"train.workers": 0}, "workers: got 0"),
+        ({"data.train": "nowhere.h5"}, "nowhere.h5"),
+        ({"sampling.keep": (0.0, 2.0)}, "keep"),
+    ],
+)
+def test_what_a_config_has_wrong_is_named(corpus_file, tmp_path, change, wanted):
+    given = config(corpus_file)
+    for name, value in change.items():
+        with given.ignore_type():
+            given.update_from_flattened_dict({name: value})
+
+    with pytest.raises(ValueError, match=wanted), jax.numpy_dtype_promotion("standard"):
+        loop.run(given, tmp_path)
+
+
+def test_validation_measures_the_last_transform(corpus_file, monkeypatch):
+    from cfr_jax.training import sources
+
+    held_out = sources.open_mixture(str(corpus_file), corpus_file.parent, "data.validation")
+    pairs = sources.fixed_pairs(held_out, 3, 24, 64, 0.3)
+    assert pairs["source"].shape == (3, 717, 3)
+    assert pairs["source_neighbors"].shape == (3, 717, 64)
+    off = np.array(pairs["transform"], np.float32)[:, None].repeat(2, axis=1)
+    off[:, 0, 0, 3] += 5
+    off[0, 1, 0, 3] += 0.5
+    monkeypatch.setattr(step, "predict", lambda *_, **__: jax.numpy.asarray(off))
+    mesh = devices.make_mesh()
+    chosen = learner.learner(config(corpus_file))
+
+    found = validation.validate(chosen, {}, {}, pairs["transform"], mesh)
+
+    np.testing.assert_allclose(found["translation_mean"], 0.5 / 3, rtol=1e-4)
+    np.testing.assert_allclose(found["recall_5deg_0.1"], 2 / 3)
+    assert found["rotation_mean"] < 0.1 and len(found["rotation_by_iteration"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("done", "left"),
+    [(0, [(3, 0), (5, 0)]), (2, [(3, 2), (5, 0)]), (3, [(5, 0)]), (7, [(5, 4)]), (8, [])],
+)
+def test_the_curriculum_goes_on_within_its_phases(done, left):
+    phases = [learner.Phase(3, 24, 6, 4), learner.Phase(5, 24, 6, 2)]
+
+    assert [(phase.steps, ran) for phase, ran in learner.remaining(phases, done)] == left

@@ -1,0 +1,216 @@
+"""Training data by name: shapes, pairs of scans, drives, single scans, and mixtures of them."""
+
+import h5py
+import numpy as np
+import pytest
+from ml_collections import ConfigDict
+from oracle import pieces
+from scipy.spatial.transform import Rotation
+
+from cfr_jax import io
+from cfr_jax.data.augment import Sampling
+from cfr_jax.training import scenes, sources
+
+FAR = np.array([5e6, -2e6, 100.0])  # map coordinates, meters
+WHOLE = Sampling(
+    points=60, neighbors=6, keep=(1.0, 1.0), noise=(0.0, 0.0), angle=45.0, translation=0.1
+)
+
+
+@pytest.fixture(scope="module")
+def surface():
+    """300 points of a bumpy ground, 40 m wide, at map coordinates."""
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(-20, 20, size=(300, 2))
+    height = 3 * np.sin(flat[:, 0] / 5) + 2 * np.cos(flat[:, 1] / 4)
+    return np.column_stack([flat, height]) + FAR
+
+
+@pytest.fixture(scope="module")
+def motion():
+    moved = np.eye(4)
+    moved[:3, :3] = Rotation.from_euler("z", 20, degrees=True).as_matrix()
+    moved[:3, 3] = FAR - moved[:3, :3] @ FAR + [5, 1, 0.2]
+    return moved
+
+
+@pytest.fixture(scope="module")
+def pairs_file(tmp_path_factory, surface, motion):
+    """Six pairs that hold the very same points, of frames (0, 1), (2, 3), ..."""
+    path = tmp_path_factory.mktemp("pairs") / "pairs.h5"
+    with h5py.File(path, "w") as file:
+        for i in range(6):
+            group = file.create_group(f"pair_{i}")
+            group["target"] = surface
+            group["source"] = (surface - motion[:3, 3]) @ motion[:3, :3]
+            group["transform"] = motion
+            group.attrs["source_frame"], group.attrs["target_frame"] = 2 * i, 2 * i + 1
+    return path
+
+
+def test_the_truth_of_a_drawn_pair_lays_one_scan_on_the_other(pairs_file):
+    source = scenes.pairs_source(pairs_file)
+
+    for seed in range(3):
+        pair = source.draw(1, WHOLE, np.random.default_rng(seed))
+
+        moved = pieces.move(pair["transform"].astype(np.float64), pair["source"])
+        # thinned each on its own, the two share many points, but not all
+        gap = np.linalg.norm(moved[:, None] - pair["target"], axis=-1).min(axis=1)
+        assert (gap < 1e-4).mean() > 0.1 and np.median(gap) < 0.25
+        assert np.linalg.norm(pair["target"], axis=1).max() < 1.6
+        assert pair["estimate_normals"] and pair["source"].shape == (60, 3)
+
+
+def test_a_pair_with_all_its_points_is_laid_exactly(pairs_file):
+    sampling = Sampling(
+        points=300, neighbors=6, keep=(1.0, 1.0), noise=(0.0, 0.0), any_orientation=1.0,
+        scale=(0.5, 2.0),
+    )  # fmt: skip
+
+    pair = scenes.pairs_source(pairs_file).draw(0, sampling, np.random.default_rng(0))
+
+    moved = pieces.move(pair["transform"].astype(np.float64), pair["source"])
+    gap = np.linalg.norm(moved[:, None] - pair["target"], axis=-1).min(axis=1)
+    assert np.quantile(gap, 0.95) < 1e-4  # the crop to 1.0 leaves out the lowest point
+
+
+def test_the_same_seed_draws_the_same_pair(pairs_file):
+    source = scenes.pairs_source(pairs_file)
+
+    first, second = (source.draw(2, WHOLE, np.random.default_rng(4)) for _ in range(2))
+
+    for key in first:
+        np.testing.assert_array_equal(first[key], second[key])
+
+
+def test_frames_choose_the_pairs_that_lie_within_them(pairs_file):
+    assert scenes.pairs_source(pairs_file, (0, 4)).names == ("pair_0", "pair_1")
+    assert scenes.pairs_source(pairs_file, (3, 9)).names == ("pair_2", "pair_3")
+    with pytest.raises(ValueError, match="none within `frames`"):
+        scenes.pairs_source(pairs_file, (100, 200))
+
+
+def given(**named):
+    return ConfigDict(named)
+
+
+def test_scans_that_are_validated_on_must_not_be_trained_on(pairs_file, tmp_path):
+    def opened(frames):
+        about = {"kind": "pairs", "path": str(pairs_file), "frames": frames}
+        return sources.open_mixture(given(room=about), tmp_path, "data.train")
+
+    sources.check_apart(opened((0, 6)), opened((6, 12)))
+    with pytest.raises(ValueError, match="2 of its 6 scans are in data.train, too"):
+        sources.check_apart(opened((0, 8)), opened((6, 12)))
+
+
+def test_single_scans_make_pairs_of_their_own(tmp_path, surface):
+    for name in ("a.ply", "b.xyz"):
+        io.write(tmp_path / name, io.PointCloud(surface))
+
+    source = scenes.scans_source(tmp_path)
+
+    assert source.names == ("a.ply", "b.xyz")
+    sampling = Sampling(
+        points=300, neighbors=6, keep=(0.6, 0.7), noise=(0.0, 0.0), translation=0.0
+    )
+    pair = source.draw(1, sampling, np.random.default_rng(0))
+    moved = pieces.move(pair["transform"].astype(np.float64), pair["source"])
+    gap = np.linalg.norm(moved[:, None] - pair["target"], axis=-1).min(axis=1)
+    assert 0.3 < (gap < 1e-3).mean() < 0.95  # each is a crop of its own
+
+
+def test_a_list_of_files_trains_too_and_needs_truths(tmp_path, surface, motion):
+    io.write(tmp_path / "target.ply", io.PointCloud(surface))
+    io.write(tmp_path / "source.ply", io.PointCloud((surface - motion[:3, 3]) @ motion[:3, :3]))
+    numbers = ",".join(map(repr, motion.ravel().tolist()))
+    (tmp_path / "train.csv").write_text(f"source.ply,target.ply,{numbers}\nsource.ply,target.ply\n")
+
+    source = scenes.pairs_source(tmp_path / "train.csv")
+
+    pair = source.draw(0, WHOLE, np.random.default_rng(0))
+    assert pair["transform"].shape == (4, 4)
+    with pytest.raises(ValueError, match="no true transform to learn from"):
+        source.draw(1, WHOLE, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="does not say from which frames"):
+        scenes.pairs_source(tmp_path / "train.csv", (0, 5))
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A drive of 12 frames, 2 m apart, along a fence, in KITTI's layout."""
+    folder = tmp_path_factory.mktemp("drive")
+    rng = np.random.default_rng(0)
+    world = rng.uniform((-20, -8, -2), (45, 8, 2), size=(4000, 3))
+    world[:, 1] = np.where(rng.random(4000) < 0.5, 8 + world[:, 2] ** 2, world[:, 1])
+    frames = folder / "sequences" / "00" / "velodyne"
+    frames.mkdir(parents=True)
+    poses = []
+    for i in range(12):
+        seen = (world - [2.0 * i, 0, 0]).astype(np.float32)
+        seen = seen[np.linalg.norm(seen, axis=1) < 20]
+        np.column_stack([seen, np.zeros(len(seen), np.float32)]).astype(np.float32).tofile(
+            frames / f"{i:06d}.bin"
+        )
+        poses.append(f"1 0 0 {2.0 * i} 0 1 0 0 0 0 1 0")
+    (folder / "poses").mkdir()
+    (folder / "poses" / "00.txt").write_text("\n".join(poses))
+    (folder / "sequences" / "00" / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    return folder
+
+
+def test_a_drive_gives_pairs_at_several_distances_within_its_frames(drive, tmp_path):
+    source = scenes.kitti_source(
+        drive, cache=tmp_path, distances=(3.0, 5.0), frames=(0, 7), stride=2
+    )
+
+    assert source.names == ("00/000000-000002", "00/000002-000004", "00/000004-000006",
+                            "00/000000-000003", "00/000002-000005")  # fmt: skip
+    pair = source.draw(0, WHOLE, np.random.default_rng(0))
+    moved = pieces.move(pair["transform"].astype(np.float64), pair["source"])
+    # 4 m of 20 m: without the truth the two would lie a fifth of a radius apart
+    everything = source.read(0)
+    truth = everything.transform
+    np.testing.assert_allclose(truth[:3, 3], [-4, 0, 0], atol=0.1)
+    assert np.isfinite(moved).all() and len(list(tmp_path.glob("truths_00_*.npz"))) == 2
+
+
+def test_named_sources_are_mixed_as_often_as_told(pairs_file, tmp_path):
+    mixture = sources.open_mixture(
+        given(
+            room={"kind": "pairs", "path": str(pairs_file), "repeat": 3},
+            out={"kind": "scans", "path": "nowhere", "repeat": 0},
+        ),
+        tmp_path,
+        "data.train",
+    )
+
+    assert len(mixture) == 18 and mixture.locate(7) == (mixture.sources[0], 1)
+
+
+def test_validation_pairs_are_the_same_every_time(pairs_file, tmp_path):
+    about = {"kind": "pairs", "path": str(pairs_file), "repeat": 2}
+    held = sources.open_mixture(given(room=about), tmp_path, "data.validation")
+
+    first, second = (sources.fixed_pairs(held, 10, 40, 64, 0.3) for _ in range(2))
+
+    assert first["source"].shape == (6, 40, 3) and first["source_neighbors"].shape == (6, 40, 39)
+    for key in first:
+        np.testing.assert_array_equal(first[key], second[key])
+
+
+@pytest.mark.parametrize(
+    ("about", "wanted"),
+    [
+        ({"kind": "video", "path": "a"}, "kind: got 'video'"),
+        ({"kind": "scans", "path": "nowhere"}, "no folder of scans at nowhere"),
+        ({"kind": "scans", "path": "a", "frames": (0, 1)}, "scans got .*frames.*wanted path"),
+        ({"kind": "pairs"}, "wanted path"),
+        ({"kind": "pairs", "path": "a", "repeat": -1}, "repeat: got -1"),
+        ({"kind": "pairs", "path": "a", "repeat": 0}, "no source"),
+    ],
+)
+def test_what_a_source_has_wrong_is_named(tmp_path, about, wanted):
+    with pytest.raises(ValueError, match=wanted):
+        sources.open_mixture(given(mine=about), tmp_path, "data.train")

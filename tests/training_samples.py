@@ -1,0 +1,85 @@
+"""What the tests of training share: a tiny corpus, a tiny recipe, and one compiled step."""
+
+import functools
+
+import h5py
+import jax
+import numpy as np
+from ml_collections import ConfigDict
+
+from cfr_jax import network, registration
+from cfr_jax.training import devices, optimizers, step
+
+POINTS, NEIGHBORS, BATCH, STEPS = 24, 6, 2, 16
+SETTINGS = registration.Settings(neighbors=NEIGHBORS, detach_motion=True)
+
+
+@functools.cache
+def optimizer():
+    schedule = optimizers.make_schedule("cosine", peak_rate=5e-3, steps=STEPS, warmup=0.1)
+    return optimizers.make_optimizer("adamw", schedule, clip=1.0, weight_decay=1e-5)
+
+
+def recipe(**changes):
+    """The one recipe of all tests, so that it compiles once."""
+    given = {
+        "unroll": registration.unroll,
+        "settings": SETTINGS,
+        "optimizer": optimizer(),
+        "mesh": devices.make_mesh(),
+        "correspondence_weight": 0.05,
+        "average_decay": 0.9,
+    }
+    return step.Recipe(**given | changes)
+
+
+def fresh():
+    return step.init_state(network.init_params(jax.random.key(0), 1), optimizer())
+
+
+def write_corpus(path, shapes=4):
+    """Ellipsoids, large enough for the protocol."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(shapes, 1100, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    with h5py.File(path, "w") as file:
+        file["data"] = directions * rng.uniform(0.4, 1, size=(shapes, 1, 3))
+        file["normal"] = directions
+        file["label"] = np.zeros(shapes, np.int64)
+    return path
+
+
+def config(corpus_file):
+    """A run of 16 steps that compiles to the recipe above."""
+    given = ConfigDict()
+    given.seed, given.network, given.iterations = 0, "cfr", 1
+    given.data = {"train": str(corpus_file), "validation": str(corpus_file)}
+    given.phases = (
+        {"steps": 2, "points": POINTS, "neighbors": NEIGHBORS, "batch": BATCH},
+        {"steps": STEPS - 2, "points": POINTS, "neighbors": NEIGHBORS, "batch": BATCH},
+    )
+    given.sampling = {"keep": (0.7, 0.7), "estimated_normals": 0.5}
+    given.train = {
+        "optimizer": "adamw", "schedule": "cosine", "peak_rate": 5e-3, "warmup": 0.1,
+        "cooldown": 0.2, "clip": 1.0, "weight_decay": 1e-5, "start_from": "",
+        "correspondence_weight": 0.05, "average_decay": 0.9, "pairs_at_once": 1, "workers": 2,
+        "precision": "float32", "max_skipped": 3,
+    }  # fmt: skip
+    given.log_every, given.checkpoint_every, given.validate_every = 4, 4, 4
+    given.validation_pairs, given.keep_checkpoints = 2, 2
+    return given
+
+
+def cheap_validation(chosen, params, placed, truth, mesh):
+    """Instead of the network: compiling that takes longer than all the rest of a test."""
+    change = np.sum(np.asarray(params["features"]["kernel_1"]) ** 2)
+    return {
+        "rotation_mean": float(change), "rotation_median": 0.0, "translation_mean": 0.0,
+        "recall_5deg_0.1": 0.0, "rotation_by_iteration": [float(change)],
+        "transforms": np.tile(np.eye(4), (len(truth), 1, 1, 1)),
+    }  # fmt: skip
+
+
+def assert_same(tree, other):
+    for a, b in zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
