@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 # Converges quadratically: on random matrices, on rank-deficient ones and on ones with repeated
 # eigenvalues the fifth sweep no longer changes a float32 result (tests/test_eigen.py).
 _SWEEPS = 5
+_HIGHEST = lax.Precision.HIGHEST
 
 
 def symmetric_eigen(
@@ -84,8 +85,10 @@ def _least_direction_jvp(primals, tangents):
     least = vectors[:, jnp.argmin(values)]
     gap = values - jnp.min(values)
     apart = gap > 1e-5
-    pull = vectors.T @ (tangent / scale @ least)
-    return least, -vectors @ jnp.where(apart, pull / jnp.where(apart, gap, 1), 0)
+    change = jnp.matmul(tangent / scale, least, precision=_HIGHEST)
+    pull = jnp.matmul(vectors.T, change, precision=_HIGHEST)
+    pull = jnp.where(apart, pull / jnp.where(apart, gap, 1), 0)
+    return least, -jnp.matmul(vectors, pull, precision=_HIGHEST)
 
 
 def _unit_scale(matrix):

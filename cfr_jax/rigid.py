@@ -122,7 +122,8 @@ def _nearest_rotation_jvp(primals, tangents):
     inverse = jnp.where(determined, 1 / jnp.where(determined, values, 1), 0)
     change = jnp.matmul(rotation.T, tangent / scale, precision=_HIGHEST)
     axial = _vee(change - change.T)
-    turn = jnp.matmul(vectors, inverse * jnp.matmul(vectors.T, axial, precision=_HIGHEST))
+    along = inverse * jnp.matmul(vectors.T, axial, precision=_HIGHEST)
+    turn = jnp.matmul(vectors, along, precision=_HIGHEST)
     return rotation, jnp.matmul(rotation, skew(turn), precision=_HIGHEST)
 
 

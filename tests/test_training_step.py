@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 import training_samples as samples
+from jax.extend.core import jaxprs_in_params
 from training_samples import BATCH, NEIGHBORS, POINTS, assert_same, fresh, recipe
 
 from cfr_jax import network, registration
@@ -31,7 +32,7 @@ def batch(tmp_path_factory):
 
 
 def step(state, batch, **changes):
-    return train_step(state, batch, recipe=recipe(**changes))
+    return train_step(state, devices.spread(batch, devices.make_mesh()), recipe=recipe(**changes))
 
 
 def test_the_loss_of_a_batch_falls(batch):
@@ -118,22 +119,26 @@ def products(jaxpr):
             files = [frame.file_name for frame in equation.source_info.traceback.frames]
             here = next(file for file in files if "/cfr_jax/" in file or "/flax/linen/" in file)
             yield here.rsplit("/", 1)[1], equation.params["precision"]
-        for inner in jax.core.jaxprs_in_params(equation.params):
+        for inner in jaxprs_in_params(equation.params):
             yield from products(inner)
 
 
-def test_only_the_products_of_the_mlps_are_less_precise_and_all_is_stored_in_float32(batch):
-    def traced(**changes):
-        return jax.make_jaxpr(lambda state: step(state, batch, **changes))(fresh()).jaxpr
+def test_only_the_products_of_the_mlps_are_less_precise_and_all_is_stored_in_float32(
+    batch, monkeypatch
+):
+    def traced(precision, backend):
+        monkeypatch.setattr(jax, "default_backend", lambda: backend)
+        advance = functools.partial(train_step.__wrapped__, recipe=recipe(precision=precision))
+        return jax.make_jaxpr(advance)(fresh(), batch).jaxpr
 
-    exact, mixed = (list(products(traced(precision=p))) for p in ("float32", "bfloat16"))
-
-    highest = jax.lax.Precision.HIGHEST
-    assert {file for file, _ in mixed} & MLPS and {file for file, _ in mixed} - MLPS
-    assert {str(precision) for _, precision in exact} == {str((highest, highest))}
-    for file, precision in mixed:
-        if file in MLPS:
-            assert precision == jax.lax.DotAlgorithmPreset.BF16_BF16_F32, file
-        else:
-            assert precision == (highest, highest), file
-    assert "bf16[" not in str(traced(precision="bfloat16"))
+    highest = (jax.lax.Precision.HIGHEST,) * 2
+    lowest = (jax.lax.Precision.DEFAULT,) * 2
+    exact, on_cpu = (list(products(traced(p, "cpu"))) for p in ("float32", "bfloat16"))
+    assert {str(precision) for _, precision in exact + on_cpu} == {str(highest)}
+    for backend, wanted in (("gpu", jax.lax.DotAlgorithmPreset.BF16_BF16_F32), ("tpu", lowest)):
+        program = traced("bfloat16", backend)
+        assert "bf16[" not in str(program)
+        mixed = list(products(program))
+        assert {file for file, _ in mixed} & MLPS and {file for file, _ in mixed} - MLPS
+        for file, precision in mixed:
+            assert precision == (wanted if file in MLPS else highest), file

@@ -34,7 +34,9 @@ def recipe(**changes):
 
 
 def fresh():
-    return step.init_state(network.init_params(jax.random.key(0), 1), optimizer())
+    """Placed as in a run: another placement would be compiled anew."""
+    state = step.init_state(network.init_params(jax.random.key(0), 1), optimizer())
+    return devices.replicate(state, devices.make_mesh())
 
 
 def write_corpus(path, shapes=4):

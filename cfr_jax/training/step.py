@@ -22,10 +22,7 @@ from cfr_jax.training.devices import AXIS
 Unroll = Callable[[dict, Cloud, Cloud, Hashable], Iterator[Step]]
 """The iterations of a network on a pair: `registration.unroll`, or `rpmnet.unroll`."""
 
-# What a matrix product whose precision is not stated in the program runs at: those of the MLPs.
-# Distances, covariances, affinities and motions state theirs, and stay float32 in every case.
-# Everything is stored and accumulated in float32; a CPU computes in float32 whatever is asked for.
-PRECISIONS = {"float32": "float32", "tensorfloat32": "tensorfloat32", "bfloat16": "BF16_BF16_F32"}
+PRECISIONS = ("float32", "tensorfloat32", "bfloat16")
 
 
 @struct.dataclass
@@ -78,7 +75,7 @@ def train_step(state: TrainState, batch: dict, *, recipe: Recipe) -> tuple[Train
     CPU one at a time keeps the activations in cache and is fastest, an accelerator wants many. A
     step whose gradient is not finite changes nothing but the counts of skipped steps.
     """
-    with jax.default_matmul_precision(PRECISIONS[recipe.precision]):
+    with jax.default_matmul_precision(_of_products(recipe.precision)):
         gradient, measured = jax.shard_map(
             functools.partial(_mean_gradient, recipe=recipe),
             mesh=recipe.mesh,
@@ -106,6 +103,18 @@ def train_step(state: TrainState, batch: dict, *, recipe: Recipe) -> tuple[Train
         skipped_in_row=jnp.where(sound, 0, state.skipped_in_row + 1),
     )
     return after, measured
+
+
+def _of_products(precision: str) -> str:
+    """What the products of the MLPs run at: those whose precision is not stated in the program.
+
+    Distances, covariances, affinities and motions state theirs, and stay float32 in every case; so
+    does everything that is stored or summed. A CPU multiplies in float32 whatever is asked for.
+    """
+    if precision != "bfloat16":
+        return precision
+    # on a TPU one pass of its unit; a GPU's default would be TF32
+    return {"cpu": "float32", "tpu": "bfloat16"}.get(jax.default_backend(), "BF16_BF16_F32")
 
 
 def _mean_gradient(params, batch, *, recipe):
