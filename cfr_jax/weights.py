@@ -42,13 +42,18 @@ class Weights:
 
 
 def save_params(path: str | Path, params: dict, notes: dict[str, str] | None = None) -> None:
-    """Writes parameters and notes about them (strings), beside first and then renamed."""
+    """Writes parameters and notes about them (strings), beside first and then renamed.
+
+    Raises OSError, naming the file, where it cannot be written.
+    """
     path, notes = Path(path), dict(notes or {})
     tensors = {name: np.asarray(leaf) for name, leaf in flatten_dict(params, sep="/").items()}
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         save_file(tensors, beside, metadata=notes | {"sha256": _digest(tensors, notes)})
         os.replace(beside, path)
+    except (SafetensorError, OSError) as error:
+        raise OSError(f"weights: {path} could not be written ({error})") from error
     finally:
         beside.unlink(missing_ok=True)
 

@@ -47,7 +47,9 @@ def get_config() -> ConfigDict:
     config.train.weight_decay = 1e-5
     config.train.correspondence_weight = 0.05
     config.train.average_decay = 0.999
-    config.train.precision = "float32"  # of the MLPs' products: or tensorfloat32, bfloat16 (GPU, TPU)
+    config.train.precision = (
+        "float32"  # of the MLPs' products: or tensorfloat32, bfloat16 (GPU, TPU)
+    )
     config.train.pairs_at_once = 1  # on an accelerator: as many as fit; their gradients are summed
     config.train.max_skipped = 20  # steps in a row whose gradient is not finite, before it stops
     config.train.workers = 1

@@ -117,7 +117,7 @@ def test_no_config_gives_a_baseline_an_option_that_it_does_not_take(path):
 
 def test_what_an_ablation_trains_is_what_it_measures():
     from cfr_jax.evaluation.network import make_network
-    from cfr_jax.trainer import learner
+    from cfr_jax.training.learner import learner
 
     evaluations, trainings = read_module(ABLATIONS), read_module(ROOT / "configs" / "ablations.py")
     for name, variants in evaluations.ABLATIONS.items():

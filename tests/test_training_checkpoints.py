@@ -225,7 +225,10 @@ def test_a_disk_that_takes_no_more_is_told_and_the_last_good_one_stays(folder, s
     assert "same command again" in str(stopped.value)
     assert len(str(stopped.value).splitlines()) <= 3
     assert_is(restore(folder), 2)
-    assert sorted(path.name for path in folder.iterdir() if path.name != ".unfinished") == ["1", "2"]
+    assert sorted(path.name for path in folder.iterdir() if path.name != ".unfinished") == [
+        "1",
+        "2",
+    ]
     save(folder, 3)
     assert_is(restore(folder), 3)
 

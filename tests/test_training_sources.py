@@ -112,9 +112,7 @@ def test_single_scans_make_pairs_of_their_own(tmp_path, surface):
     source = scenes.scans_source(tmp_path)
 
     assert source.names == ("a.ply", "b.xyz")
-    sampling = Sampling(
-        points=300, neighbors=6, keep=(0.6, 0.7), noise=(0.0, 0.0), translation=0.0
-    )
+    sampling = Sampling(points=300, neighbors=6, keep=(0.6, 0.7), noise=(0.0, 0.0), translation=0.0)
     pair = source.draw(1, sampling, np.random.default_rng(0))
     moved = pieces.move(pair["transform"].astype(np.float64), pair["source"])
     gap = np.linalg.norm(moved[:, None] - pair["target"], axis=-1).min(axis=1)

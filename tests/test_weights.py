@@ -50,7 +50,7 @@ def test_any_flipped_bit_is_noticed(saved):
     content = bytearray(saved.read_bytes())
     header = 8 + int.from_bytes(content[:8], "little")
     rng = np.random.default_rng(0)
-    places = [*rng.integers(0, header, 60), *rng.integers(header, len(content), 140)]
+    places = [*rng.integers(0, header, 150), *rng.integers(header, len(content), 350)]
 
     for place in places:
         bit = 1 << int(rng.integers(8))

@@ -8,7 +8,8 @@ import numpy as np
 from ml_collections import ConfigDict
 
 from cfr_jax import network, registration
-from cfr_jax.training import devices, optimizers, step
+from cfr_jax.training import devices, step
+from cfr_jax.training.optimizers import make_optimizer, make_schedule
 
 POINTS, NEIGHBORS, BATCH, STEPS = 24, 6, 2, 16
 SETTINGS = registration.Settings(neighbors=NEIGHBORS, detach_motion=True)
@@ -16,8 +17,8 @@ SETTINGS = registration.Settings(neighbors=NEIGHBORS, detach_motion=True)
 
 @functools.cache
 def optimizer():
-    schedule = optimizers.make_schedule("cosine", peak_rate=5e-3, steps=STEPS, warmup=0.1)
-    return optimizers.make_optimizer("adamw", schedule, clip=1.0, weight_decay=1e-5)
+    schedule = make_schedule("cosine", peak_rate=5e-3, steps=STEPS, warmup=0.1)
+    return make_optimizer("adamw", schedule, clip=1.0, weight_decay=1e-5)
 
 
 def recipe(**changes):

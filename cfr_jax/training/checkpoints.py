@@ -110,8 +110,8 @@ class Checkpoints:
             state = self._writer.restore(folder / "state", shapes)
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
-                f"{folder} holds another kind of training: was the network or the optimizer changed "
-                "in the config? Take another workdir, or the config of about.json there"
+                f"{folder} holds another kind of training: was the network or the optimizer "
+                "changed in the config? Take another workdir, or the config of about.json there"
             ) from error
         return state, json.loads((folder / "about.json").read_text("utf-8"))
 

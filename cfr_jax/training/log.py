@@ -60,9 +60,15 @@ class Journal:
         os.replace(beside, path)
 
     def write(self, line: dict) -> None:
-        """Appends one line."""
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line) + "\n")
+        """Appends one line. Raises OSError, naming the file, where that cannot be written."""
+        try:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(line) + "\n")
+        except OSError as error:
+            raise OSError(
+                f"{self.path} could not be written ({error.strerror}); make room, then run the "
+                "same command again"
+            ) from error
 
 
 def read_journal(path: Path) -> list[dict]:

@@ -80,7 +80,7 @@ def run(config: Any, workdir: Path) -> dict:
         if restored is not None:
             state, before = restored
             _warn_of_changes(before["config"], about["config"])
-            about |= {key: before[key] for key in ("best", "position", "clock")}
+            about |= {key: before[key] for key in ("best", "validation", "position", "clock")}
         done = int(state.step)
         reports = Reports(workdir, total, done, about["clock"], schedule, pairs)
         for phase, ran in remaining(phases, done):
@@ -106,9 +106,7 @@ def run(config: Any, workdir: Path) -> dict:
             )
             reports.resume()
             for batch in stream:
-                state, measured = step.train_step(
-                    state, devices.spread(batch, mesh), recipe=recipe
-                )
+                state, measured = step.train_step(state, devices.spread(batch, mesh), recipe=recipe)
                 done, about["position"] = done + 1, about["position"] + phase.batch
                 reports.step(done, measured)
                 if done % config.log_every == 0:
@@ -121,9 +119,10 @@ def run(config: Any, workdir: Path) -> dict:
                         chosen, state.average, placed, pairs["transform"], mesh
                     )
                     reports.validated(done, found)
-                    found = {name: value for name, value in found.items() if name != "transforms"}
+                    del found["transforms"]
+                    about["validation"] = {"step": done, **found}
                     if found["rotation_mean"] < about["best"].get("rotation_mean", np.inf):
-                        about["best"] = {"step": done, **found}
+                        about["best"] = about["validation"]
                         if devices.is_first():
                             weights.save_params(
                                 workdir / "weights.safetensors",
@@ -133,9 +132,7 @@ def run(config: Any, workdir: Path) -> dict:
                     reports.resume()
                 if validating or done % config.checkpoint_every == 0:
                     about |= {"clock": reports.clock.read(), "skipped": int(state.skipped)}
-                    checkpoints.save(
-                        state, about | {"step": done}, best=about["best"].get("step")
-                    )
+                    checkpoints.save(state, about | {"step": done}, best=about["best"].get("step"))
         about |= {"clock": reports.clock.read(), "skipped": int(state.skipped)}
         reports.close(about | {"step": done})
     return about["best"]
@@ -164,6 +161,7 @@ def _about(config) -> dict:
     versions |= {"cfr_jax": __version__, "python": platform.python_version()}
     return {
         "best": {},
+        "validation": {},  # the last one
         "position": 0,  # pairs of the stream that were used; with the seed it decides all others
         "random_key": np.asarray(jax.random.key_data(jax.random.key(config.seed))).tolist(),
         "skipped": 0,
@@ -175,9 +173,7 @@ def _about(config) -> dict:
 
 
 def _warn_of_changes(before: dict, now: dict) -> None:
-    changed = sorted(
-        key for key in before.keys() | now.keys() if before.get(key) != now.get(key)
-    )
+    changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     if changed:
         warnings.warn(
             f"the config differs from the checkpoint's in {', '.join(changed)}: going on by the "

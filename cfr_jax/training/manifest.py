@@ -24,9 +24,11 @@ def write(folder: Path) -> None:
 def verify(folder: Path) -> None:
     """Raises `Damaged` unless `folder` holds what its manifest says, no less and no more."""
     try:
-        told = (folder / NAME).read_bytes()
+        told, found = (folder / NAME).read_bytes(), _files(folder)
     except FileNotFoundError as error:
         raise Damaged(f"{folder} has no {NAME}: it was never finished") from error
+    except OSError as error:  # a disk that cannot read its own sectors
+        raise Damaged(f"{error.filename} cannot be read ({error.strerror})") from error
     try:
         wanted = json.loads(told)["files"]
     except (ValueError, KeyError, TypeError) as error:
@@ -34,7 +36,6 @@ def verify(folder: Path) -> None:
     # byte by byte: what a flipped bit leaves readable is damage, too
     if not isinstance(wanted, dict) or told != _text(wanted):
         raise Damaged(f"{folder / NAME} is not as it was written")
-    found = _files(folder)
     for name in sorted(wanted.keys() | found.keys()):
         if name not in found:
             raise Damaged(f"{folder / name} is missing")

@@ -19,7 +19,7 @@ figcaption { font-weight: 600; } svg { background: #fafbfc; border: 1px solid #e
 td, th { text-align: left; padding: .15rem 1.2rem .15rem 0; font-variant-numeric: tabular-nums; }
 pre { background: #fafbfc; border: 1px solid #e3e6ea; padding: .6rem; overflow-x: auto; }
 """
-Curve = tuple[str, Sequence[float], Sequence[float]]
+Curve = tuple[str, Sequence[int], Sequence[float]]
 """A name, steps, values."""
 
 

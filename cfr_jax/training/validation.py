@@ -23,9 +23,7 @@ def validate(chosen: Learner, params: dict, placed: dict, truth: np.ndarray, mes
     """Rotation (degrees) and translation errors of the last transform against `truth` (b, 4, 4),
     their recall, and the mean rotation error of every iteration; and all transforms (b, L, 4, 4).
     """
-    found = step.predict(
-        params, placed, unroll=chosen.unroll, settings=chosen.validated, mesh=mesh
-    )
+    found = step.predict(params, placed, unroll=chosen.unroll, settings=chosen.validated, mesh=mesh)
     transforms = devices.gather(found)[: len(truth)].astype(np.float64)
     truth = np.asarray(truth, np.float64)
     rotation = metrics.err_r(transforms[:, -1], truth)

@@ -1,0 +1,42 @@
+"""Training on scans of your own: a folder of single scans, and perhaps pairs with known motions.
+
+See docs/train-on-your-data.md.
+"""
+
+import importlib.util
+from pathlib import Path
+
+from ml_collections import ConfigDict
+
+
+def get_config() -> ConfigDict:
+    """As `scans.py`, with the data that you name: --config.data.train.scans.path=FOLDER and so on.
+
+    A source is left out where its `repeat` is 0.
+    """
+    config = _scans().get_config()
+    config.data = ConfigDict()
+    config.data.train = {
+        # views of one scan, turned and cropped: needs no known motion
+        "scans": {"kind": "scans", "path": "", "repeat": 1},
+        # a CSV list `source,target,16 numbers`, or HDF5
+        "pairs": {"kind": "pairs", "path": "", "repeat": 0},
+    }
+    config.data.validation = {
+        "scans": {"kind": "scans", "path": "", "repeat": 1},
+        "pairs": {"kind": "pairs", "path": "", "repeat": 0},
+    }
+    config.sampling.keep = (0.5, 0.9)
+    config.sampling.estimated_normals = 0.7  # of those that have normals; the rest always
+    config.sampling.noise = (0.0, 0.01)
+    config.sampling.outliers = (0.0, 0.03)
+    return config
+
+
+def _scans():
+    # a config is a file and no module: it is found beside this one
+    path = Path(__file__).with_name("scans.py")
+    spec = importlib.util.spec_from_file_location("scans", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,95 @@
+"""Optimizers and learning rates do what their names say."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cfr_jax.training.optimizers import OPTIMIZERS, make_optimizer, make_schedule
+
+
+@pytest.fixture(autouse=True)
+def promotion_as_optax_needs_it():
+    """Its schedules and moments mix integers with floats."""
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+def rates(kind, **changes):
+    given = {"peak_rate": 1.0, "steps": 100, "warmup": 0.1, "cooldown": 0.2} | changes
+    schedule = make_schedule(kind, **given)
+    return np.array([float(schedule(step)) for step in range(101)])
+
+
+@pytest.mark.parametrize("kind", ["cosine", "wsd", "constant"])
+def test_every_rate_rises_from_a_25th_to_the_peak(kind):
+    found = rates(kind)
+
+    assert found[0] == pytest.approx(1 / 25) and found[10] == pytest.approx(1.0)
+    assert (np.diff(found[:11]) > 0).all() and found.max() <= 1 + 1e-6
+
+
+def test_cosine_falls_along_half_a_wave():
+    found = rates("cosine")
+
+    wanted = 0.001 + 0.999 * 0.5 * (1 + np.cos(np.pi * np.linspace(0, 1, 91)))
+    np.testing.assert_allclose(found[10:], wanted, atol=1e-5)
+
+
+def test_wsd_stays_and_then_falls_in_a_straight_line():
+    found = rates("wsd")
+
+    np.testing.assert_allclose(found[10:81], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(found[80:], np.linspace(1, 0.001, 21), atol=1e-5)
+
+
+def test_constant_stays():
+    np.testing.assert_allclose(rates("constant")[10:], 1.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", OPTIMIZERS)
+def test_every_optimizer_finds_the_bottom_of_a_bowl(kind):
+    rule = make_optimizer(kind, lambda _: 0.05, clip=1.0, weight_decay=0.0)
+    x = jnp.array([1.0, -2.0])
+    state = rule.init(x)
+    for _ in range(150):
+        updates, state = rule.update(2 * x, state, x)
+        x = x + updates
+
+    assert float(jnp.abs(x).max()) < 0.15
+
+
+@pytest.mark.parametrize("kind", OPTIMIZERS)
+def test_weights_shrink_where_nothing_pulls(kind):
+    rule = make_optimizer(kind, lambda _: 0.1, clip=1.0, weight_decay=0.1)
+    x = jnp.array([1.0])
+    updates, _ = rule.update(jnp.zeros(1), rule.init(x), x)
+
+    assert float(updates[0]) < 0
+
+
+def test_the_gradient_is_clipped_by_its_norm():
+    rule = make_optimizer("sgd", lambda _: 1.0, clip=1.0, weight_decay=0.0)
+    x = jnp.zeros(2)
+
+    long, _ = rule.update(jnp.array([30.0, 40.0]), rule.init(x), x)
+    short, _ = rule.update(jnp.array([0.3, 0.4]), rule.init(x), x)
+
+    np.testing.assert_allclose(long, 2 * np.array(short), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "wanted"),
+    [
+        ({"kind": "step"}, "got 'step', wanted one of cosine, wsd, constant"),
+        ({"steps": 0}, "0 steps"),
+        ({"warmup": 1.0}, "warmup 1.0"),
+        ({"cooldown": 0.95}, "cooldown 0.95"),
+    ],
+)
+def test_impossible_rates_are_refused(change, wanted):
+    given = {"kind": "wsd", "peak_rate": 1.0, "steps": 10, "warmup": 0.1} | change
+    with pytest.raises(ValueError, match=wanted):
+        make_schedule(given.pop("kind"), **given)
+    with pytest.raises(ValueError, match="optimizer: got 'adagrad'"):
+        make_optimizer("adagrad", lambda _: 1.0, clip=1.0, weight_decay=0.0)
