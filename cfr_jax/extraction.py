@@ -77,7 +77,7 @@ def _forward(layers, raw, valid, *, groups):
     tiles = _cut(raw, count).reshape(count, -1, raw.shape[-1])
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
 
-    norm_one = norm_of(*_moments_of_first(one, raw, valid, rows), groups)
+    norm_one = norm_of(*_moments_of_first(one, tiles, valid, rows), groups)
     kernel_one, bias_one = fold(one, norm_one)
 
     # Both passes leave sums per point, and the mask weighs them afterwards: reductions that follow
@@ -218,9 +218,18 @@ def _moments(sums, valid, rows, bias, sign=1):
     return total * sign + bias, square - total * total
 
 
-def _moments_of_first(layer, raw, valid, rows):
-    weight = jnp.broadcast_to(valid[:, None, None], raw.shape[:2] + (1,))
-    mean = (weight * raw).sum((0, 1)) / rows
-    centered = (raw - mean) * weight
-    covariance = jnp.einsum("nkc,nkd->cd", centered, centered) / rows
+def _moments_of_first(layer, tiles, valid, rows):
+    # tile by tile: on CPU the product copies what it is made of
+    count, _, channels = tiles.shape
+    weights = _cut(valid, count)
+    each = tiles.reshape(*weights.shape, -1, channels)
+    mean = jnp.sum(weights[:, :, None, None] * each, (0, 1, 2)) / rows
+
+    def add(gram, tile):
+        raw, weight = tile
+        centered = ((raw - mean) * weight[:, None, None]).reshape(-1, channels)
+        return gram + centered.T @ centered, None
+
+    gram, _ = lax.scan(add, jnp.zeros((channels, channels), tiles.dtype), (each, weights))
+    covariance = gram / rows
     return mean @ layer.kernel + layer.bias, ((covariance @ layer.kernel) * layer.kernel).sum(0)
