@@ -12,8 +12,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from cfr_jax import confidence, doubts, solving
-from cfr_jax.planning import Plan, planned
+from cfr_jax import confidence, doubts, pyramid, solving
+from cfr_jax.planning import Plan, planned, read_clouds
 from cfr_jax.weights import load_params
 
 
@@ -88,6 +88,7 @@ def align(
     refine: bool = True,
     initial: Float[np.ndarray, "4 4"] | None = None,
     max_points: int | None = None,
+    all_points: bool = False,
     seed: int = 0,
 ) -> Alignment:
     """Finds the rigid motion that lays `source` on `target`.
@@ -96,6 +97,8 @@ def align(
     They are centered and scaled in float64, thinned to `max_points` each (default 1,024; `seed`
     says which), given normals where they have none, registered by the network with `params`
     (default: the weights that ship) and refined (`refinement.refine`; off with `refine=False`).
+    With `all_points` it is refined further on every point there is (`pyramid`); `fitness` and
+    `inlier_rmse` are then of all points, too.
 
     `initial` (4, 4) moves the source close to the target first; without it the centroids are laid
     on each other. The network is trained for up to 45 degrees about each axis from there. The same
@@ -106,6 +109,11 @@ def align(
     `io.CloudFileError` for files.
     """
     began = time.perf_counter()
+    if all_points and not refine:
+        raise ValueError(
+            "all_points: got True with refine=False, wanted a refinement to go on from"
+        )
+    source, target = read_clouds(source, target)
     plan = planned(source, target, initial=initial, max_points=max_points, seed=seed)
     params = checked_params(params)
     arguments = params, solving.on_device(plan.source), solving.on_device(plan.target)
@@ -113,6 +121,8 @@ def align(
     program = solving.compiled(solving.solve_pair, *arguments, refine=refine)
     compiled = time.perf_counter()
     found = jax.block_until_ready(program(*arguments))
+    if all_points:
+        found = pyramid.on_all_points(plan, source, target, found)
     done = time.perf_counter()
     seconds = {"compile": compiled - started, "run": done - compiled, "total": done - began}
     return answer(plan, found, seconds)

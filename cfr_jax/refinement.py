@@ -114,12 +114,25 @@ def _descend(source, target, transform, stage):
 
 def _gauss_newton(source, target, transform, stage):
     """The twist that lessens sum_i w_i r_i' M_i r_i the most, r = T x - y, linearized."""
+    found = closest(rigid.apply(transform, source.points), target.points, target.mask)
+    partners = target.points[found.index], target.normals[found.index]
+    return solve(*normal_equations(source, *partners, transform, stage))
+
+
+def normal_equations(
+    source: Surface,
+    partners: Float[Array, "n 3"],
+    partner_normals: Float[Array, "n 3"],
+    transform: Float[Array, "4 4"],
+    stage: Stage,
+) -> tuple[Float[Array, "6 6"], Float[Array, " 6"]]:
+    """What one Gauss-Newton step solves, summed over the pairs of source points and partners;
+    sums over parts of a cloud add up. Pairs further apart than the cut have no say."""
     moved = rigid.apply(transform, source.points)
-    found = closest(moved, target.points, target.mask)
-    weight = jnp.maximum(1 - found.square / stage.cut**2, 0) ** 2
+    residual = moved - partners
+    weight = jnp.maximum(1 - jnp.sum(residual**2, axis=1) / stage.cut**2, 0) ** 2
     weight = jnp.where(source.mask, weight, 0)
-    residual = moved - target.points[found.index]
-    normals = rigid.rotate(transform, source.normals), target.normals[found.index]
+    normals = rigid.rotate(transform, source.normals), partner_normals
     metric = weight[:, None, None] * _inverse_symmetric(
         sum(_plane(n, stage.thickness) for n in normals)
     )
@@ -130,7 +143,11 @@ def _gauss_newton(source, target, transform, stage):
     )
     weighted = jnp.einsum("nij,nik->njk", metric, jacobian, precision=_HIGHEST)
     system = jnp.einsum("nji,njk->ik", jacobian, weighted, precision=_HIGHEST)
-    pull = jnp.einsum("nij,ni->j", weighted, residual, precision=_HIGHEST)
+    return system, jnp.einsum("nij,ni->j", weighted, residual, precision=_HIGHEST)
+
+
+def solve(system: Float[Array, "6 6"], pull: Float[Array, " 6"]) -> Float[Array, " 6"]:
+    """The step: a left twist, rotation first."""
     # keeps directions that nothing determines (a line turning about itself) at rest
     damping = 1e-6 * jnp.trace(system) + jnp.finfo(system.dtype).tiny
     return -jnp.linalg.solve(system + damping * jnp.eye(6, dtype=system.dtype), pull)

@@ -31,6 +31,7 @@ LAYERS = (
     ("training",),
     ("planning",),
     ("solving", "doubts"),
+    ("pyramid",),
     ("alignment",),
     ("batch",),
     ("reproduction",),

@@ -105,6 +105,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="most points of each cloud that the network sees; more are slower (default: chosen)",
     )
     how.add_argument(
+        "--all-points",
+        action="store_true",
+        help="refine further on every point of large clouds, after the thinned ones",
+    )
+    how.add_argument(
         "--seed",
         metavar="S",
         type=_not_negative,
@@ -140,6 +145,7 @@ def run(args: argparse.Namespace) -> int:
         refine=not args.no_refine,
         initial=initial,
         max_points=args.max_points,
+        all_points=args.all_points,
         seed=args.seed,
     )
     if args.out is not None:

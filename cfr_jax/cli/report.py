@@ -45,6 +45,7 @@ def register(
     refine: bool = True,
     initial: Float64[np.ndarray, "4 4"] | None = None,
     max_points: int | None = None,
+    all_points: bool = False,
     seed: int = 0,
 ) -> Result:
     """`align` with weights by name or path; raises ValueError as `align` and `read_weights` do."""
@@ -56,6 +57,7 @@ def register(
         refine=refine,
         initial=initial,
         max_points=max_points,
+        all_points=all_points,
         seed=seed,
     )
     return Result(source, target, initial, seed, chosen, alignment)
