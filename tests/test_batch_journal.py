@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import socket
+import subprocess
+import sys
 
+import jax
 import pytest
 
 from cfr_jax.batch.journal import Journal
-from cfr_jax.batch.sharding import Shard, other_shards, parse_shard
+from cfr_jax.batch.sharding import Shard, other_shards, parse_shard, process_shard
 
 MADE_WITH = {"weights": "a" * 64, "seed": 0}
 
@@ -123,3 +127,36 @@ def test_shards_are_found_beside_the_whole(tmp_path):
     for path in (*parts, whole, tmp_path / "other.1-of-2.jsonl"):
         path.touch()
     assert other_shards(whole) == parts
+
+
+def test_processes_of_a_cluster_share_the_list(monkeypatch):
+    assert process_shard() is None
+    monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(jax, "process_index", lambda: 2)
+    monkeypatch.setattr(jax, "process_count", lambda: 5)
+    assert process_shard() == Shard(3, 5)
+
+
+_MEMBER = """
+import sys, jax
+from cfr_jax.batch.sharding import process_shard
+jax.distributed.initialize(sys.argv[1], 2, int(sys.argv[2]))
+print(*process_shard())
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_of_jax_distributed_know_their_shares():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        place = f"127.0.0.1:{free.getsockname()[1]}"
+    members = [
+        subprocess.Popen(
+            [sys.executable, "-c", _MEMBER, place, str(number)], stdout=subprocess.PIPE, text=True
+        )
+        for number in (0, 1)
+    ]
+    assert [member.communicate(timeout=120)[0].split() for member in members] == [
+        ["1", "2"],
+        ["2", "2"],
+    ]

@@ -80,6 +80,7 @@ MISTAKES = {
     "the list as the table": ("batch good.csv --out good.csv", "would be written over"),
     "a folder as the table": ("batch good.csv --out dir.csv", "is a folder, wanted a file"),
     "shard five of four": ("batch good.csv --out r.csv --shard 5/4", "wanted I/N with I from 1"),
+    "no cluster": ("batch good.csv --out r.csv --shard auto", "give --shard I/N instead"),
     "no workers": ("batch good.csv --out r.csv --workers 0", "an integer of at least 1"),
     "a file of theirs": ("batch good.csv --out theirs.csv", "choose another --out"),
     "other settings": ("batch good.csv --out begun.csv", "give the same options to go on"),

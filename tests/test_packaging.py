@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
+import subprocess
 import sys
 import tomllib
+import venv
 import zipfile
 from pathlib import Path
 
@@ -151,3 +154,34 @@ def test_every_extra_that_a_message_names_exists():
     }
     wanted = {"io", "viz", "torch", "rerun", "completion"}
     assert wanted <= named <= set(PROJECT["optional-dependencies"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["wheel", "source"])
+def test_it_installs_and_runs_in_an_empty_environment(form, wheel, tmp_path):
+    # given
+    venv.create(tmp_path / "env", with_pip=True)
+    python = tmp_path / "env/bin/python"
+    what = wheel.filename if form == "wheel" else str(ROOT)
+
+    def run(*command: str) -> str:
+        child = subprocess.run(
+            command, capture_output=True, text=True, cwd=tmp_path, env={"HOME": str(tmp_path)}
+        )
+        assert child.returncode == 0, child.stdout + child.stderr
+        return child.stdout
+
+    # when
+    subprocess.run([python, "-m", "pip", "install", "--quiet", what], check=True)
+
+    # then: from another folder than the sources
+    cfr = str(tmp_path / "env/bin/cfr")
+    assert run(cfr, "--version") == run(str(python), "-m", "cfr_jax", "--version")
+    assert cfr_jax.__version__ in run(cfr, "--version")
+    assert json.loads(run(cfr, "models", "--json"))["models"][0]["name"] == "object"
+    where = run(str(python), "-c", "import cfr_jax; print(cfr_jax.__file__)")
+    assert where.startswith(str(tmp_path))
+    demo = Path(where.strip()).parent / "demo"
+    (tmp_path / "pairs.csv").write_text(f"{demo}/source.ply,{demo}/target.ply\nnone.ply,none.ply\n")
+    told = run(cfr, "batch", "pairs.csv", "--out", "results.csv", "--max-points", "300")
+    assert "registered  1" in told and "failed      none.ply" in told

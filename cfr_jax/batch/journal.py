@@ -16,7 +16,7 @@ from typing import Any
 try:
     import fcntl
 except ImportError:  # Windows: whoever starts two of one name there has to know better
-    fcntl = None  # type: ignore[assignment]
+    fcntl = None
 
 FORMAT = "cfr_jax/batch/1"
 Key = tuple[str, str, int]

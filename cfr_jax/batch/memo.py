@@ -21,10 +21,9 @@ class Memo:
         """The value of `key`, made by `make` if it is not there; what `make` raises is raised to
         all who wait, and forgotten."""
         with self._lock:
-            future = self._held.get(key)
-            mine = future is None
+            mine = key not in self._held
+            future = self._held.setdefault(key, Future())
             if mine:
-                future = self._held[key] = Future()
                 if len(self._held) > self._most:
                     self._held.popitem(last=False)
             self._held.move_to_end(key)

@@ -215,7 +215,7 @@ def _shard(wish: str | None) -> Shard | None:
             jax.distributed.initialize()
     except (ValueError, RuntimeError) as error:
         raise ValueError(
-            f"--shard auto: no cluster tells this process its number ({error})\n"
-            "give --shard I/N instead"
+            "--shard auto: no cluster tells this process its number; give --shard I/N instead\n"
+            f"({str(error).splitlines()[0]})"
         ) from None
     return process_shard()
