@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from typing import Any
 
 SHELLS = ("bash", "zsh", "fish")
 
@@ -45,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _complete_files(parser: argparse.ArgumentParser, file: dict[str, str]) -> None:
+def _complete_files(parser: argparse.ArgumentParser, file: Any) -> None:
     """Arguments that are paths are completed as such, in every command."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
