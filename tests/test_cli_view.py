@@ -23,7 +23,7 @@ def result(tmp_path) -> report.Result:
     source, target = (io.read(path) for path in paths)
     found = cli_samples.alignment(source, target, warnings=("small clouds",))
     answer = report.Result(
-        source, target, cli_samples.motion(3.0), 0, Weights({}, "w", "0" * 64, {}), found
+        source, target, cli_samples.motion(3.0), 0, Weights({}, "w", "cfr", "0" * 64, {}), found
     )
     document = report.as_document(answer, *paths)
     (tmp_path / "result.json").write_text(json.dumps(document))
