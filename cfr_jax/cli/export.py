@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     from cfr_jax.export import export_register, save_exported
     from cfr_jax.weights import DEFAULT, read_weights
 
-    weights = read_weights(DEFAULT if args.weights is None else args.weights)
+    weights = read_weights(DEFAULT if args.weights is None else args.weights, "cfr")
     platforms = [name.strip() for name in args.platforms.split(",")]
     exported = export_register(
         weights.params,
