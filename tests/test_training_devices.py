@@ -44,7 +44,7 @@ def start(folder, workdir, devices=1, *, stop_after=0, **group):
     )  # fmt: skip
 
 
-def finish(*processes, timeout=600):
+def finish(*processes, timeout=1800):
     for process in processes:
         output, _ = process.communicate(timeout=timeout)
         assert process.returncode == 0, output

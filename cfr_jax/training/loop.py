@@ -70,9 +70,10 @@ def run(config: Any, workdir: Path) -> dict:
         clip=config.train.clip,
         weight_decay=config.train.weight_decay,
     )
-    params = chosen.fresh(jax.random.key(config.seed))
     if config.train.start_from:
         params = weights.load_params(config.train.start_from, config.network)
+    else:
+        params = jax.jit(chosen.fresh)(jax.random.key(config.seed))
     state = devices.replicate(step.init_state(params, optimizer), mesh)
     about = _about(config)
     with Checkpoints(workdir / "checkpoints", keep=config.keep_checkpoints) as checkpoints:
