@@ -30,8 +30,10 @@ def schema(name):
     return jsonschema.Draft202012Validator(held)
 
 
-def test_all_weights_that_ship_have_a_card_that_is_theirs():
-    assert cards.names() == shipped()
+def test_all_weights_of_ours_that_ship_have_a_card_that_is_theirs():
+    # those of other networks are there to be compared with, and nobody registers by them
+    ours = [name for name in shipped() if read_weights(name).network == "cfr"]
+    assert list(cards.names()) == ours
     for name in cards.names():
         weights, card = read_weights(name), cards.read_card(name)
         assert card["sha256"] == weights.sha256
