@@ -1,11 +1,15 @@
-"""Fits the confidence of `align` to validation pairs, and says how well it is calibrated.
+"""Fits the confidences of `register` and of `align` to validation pairs, or measures them.
 
-    python -m benchmarks.fit_confidence --corpus ../shared/data/open_cad/val.h5
+    python -m benchmarks.fit_confidence --corpus ../shared/data/open_cad/val.h5 --pairs 500 --fit
+    python -m benchmarks.fit_confidence --corpus ../shared/data/open_cad/test.h5 --pairs 300 \\
+        --figure docs/images/confidence.png
 
-Pairs: the partial protocol with estimated normals; beside them, so that wrong answers of every kind
-are seen, rotations of up to 180 degrees and pairs of two different shapes. Half of the shapes fit
-the logistic regression, the other half measures it; what ships is fitted to all. Writes
-cfr_jax/models/confidence.json. Validation shapes only: never the test set.
+Of ten pairs three are of the partial protocol with exact normals and two with estimated ones; two
+keep only half of each shape (one with estimated normals); one is turned by any rotation and
+searched globally; one is turned by up to 90 degrees about each axis and is not; and one is of two
+different shapes. The first form cross-validates by shape, then fits to all pairs and writes
+cfr_jax/calibration.py. The second measures what ships on shapes that it was not fitted to, and
+draws. `--clues FILE.npz` keeps what was gathered: a call that was cut off goes on from there.
 """
 
 from __future__ import annotations
@@ -19,38 +23,67 @@ import numpy as np
 import tqdm
 from scipy.optimize import minimize
 
-from cfr_jax import confidence, metrics
+from benchmarks import reliability
+from cfr_jax import calibration, confidence, metrics
 from cfr_jax.alignment import align
+from cfr_jax.cli.cache import keep_compiled_programs
 from cfr_jax.data.corpus import Corpus, read_corpus
-from cfr_jax.data.protocol import Protocol, partial, random_pair
+from cfr_jax.data.protocol import low_overlap, partial, partial_any_rotation, random_pair
 from cfr_jax.viewer.atomic import write_atomically
 
-CLUES = tuple(field.name for field in dataclasses.fields(confidence.Clues))
+OF_NETWORK = tuple(field.name for field in dataclasses.fields(confidence.NetworkClues))
+OF_SURFACES = tuple(f.name for f in dataclasses.fields(confidence.Clues) if f.name != "network")
+CLUES = OF_NETWORK + OF_SURFACES
 _PENALTY = 1e-3  # on the squared weights: clues overlap
-_TURNED = dataclasses.replace(partial, name="turned", angle=180.0)
+_TURNED = dataclasses.replace(partial, name="turned", angle=90.0)
+# protocol, whether normals are estimated
+_MIX = (
+    *[(partial, False)] * 3, *[(partial, True)] * 2, (low_overlap, False), (low_overlap, True),
+    (partial_any_rotation, False), (_TURNED, False), (partial, True),
+)  # fmt: skip
+_SEARCHED, _DIFFERENT = 7, 9  # places in the mix
+_FOLDS = 5
 
 
-def gather(corpus: Corpus, count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Clues (n, c), whether the answer was right (n,), and the shape's number (n,)."""
-    rng = np.random.default_rng(seed)
-    clues, right, shapes = [], [], []
-    for number in tqdm.trange(count):
-        shape = int(rng.integers(len(corpus)))
-        kind = number % 8  # of eight pairs six by the protocol, one turned, one of two shapes
-        protocol: Protocol = _TURNED if kind == 6 else partial
-        pair = random_pair(*corpus[shape], protocol, rng)
-        target = pair.target
-        if kind == 7:
-            other = int(rng.integers(len(corpus)))
-            target = random_pair(*corpus[other], partial, rng).target
-        found = align(pair.source, target)
-        truth, estimate = pair.transform[None].astype(float), found.transform[None]
-        errors = metrics.err_r(estimate, truth), metrics.err_t(estimate, truth)
-        close = metrics.recalled(*errors, 5.0, 0.1)[0]
-        clues.append([found.clues[name] for name in CLUES])
-        right.append(bool(close) and kind != 7)
-        shapes.append(shape)
-    return np.array(clues), np.array(right), np.array(shapes)
+@dataclasses.dataclass
+class Gathered:
+    """What was found of `n` pairs: clues, whether register and align were right, the shape."""
+
+    clues: np.ndarray
+    right: np.ndarray
+    shape: np.ndarray
+
+
+def gather(corpus: Corpus, count: int, seed: int, kept: Path | None) -> Gathered:
+    """The first `count` pairs of the mix; each depends on its number alone."""
+    rows: list[list[float]] = []
+    if kept is not None and kept.exists():
+        rows = np.load(kept)["rows"][:count].tolist()
+    for number in tqdm.trange(len(rows), count, initial=len(rows), total=count):
+        rows.append(_row(corpus, number, np.random.default_rng((seed, number))))
+        if kept is not None and (len(rows) % 10 == 0 or len(rows) == count):
+            np.savez(kept, rows=np.array(rows))
+    held = np.array(rows)
+    return Gathered(held[:, :-3], held[:, -3:-1].astype(bool), held[:, -1].astype(int))
+
+
+def _row(corpus, number, rng):
+    protocol, estimated = _MIX[number % len(_MIX)]
+    shape, other = (int(rng.integers(len(corpus))) for _ in range(2))
+    pair = random_pair(*corpus[shape], protocol, rng)
+    target = pair
+    if number % len(_MIX) == _DIFFERENT:
+        target = random_pair(*corpus[other], protocol, rng)
+    clouds = (pair.source, pair.source_normals), (target.target, target.target_normals)
+    found = align(
+        *(points if estimated else np.hstack([points, normals]) for points, normals in clouds),
+        initial="global" if number % len(_MIX) == _SEARCHED else None,
+    )
+    answers = np.stack([found.transforms[-1], found.transform])
+    truth = np.repeat(pair.transform[None].astype(float), 2, axis=0)
+    errors = metrics.err_r(answers, truth), metrics.err_t(answers, truth)
+    right = metrics.recalled(*errors, 5.0, 0.1) & (target is pair)
+    return [*(found.clues[name] for name in CLUES), *right, shape]
 
 
 def fit(clues: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -74,45 +107,59 @@ def predict(fitted: np.ndarray, clues: np.ndarray) -> np.ndarray:
     return 1 / (1 + np.exp(-(clues @ fitted[:-1] + fitted[-1])))
 
 
-def calibration_error(chance: np.ndarray, right: np.ndarray, bins: int = 10) -> float:
-    """Expected calibration error over bins of equal width."""
-    place = np.minimum((chance * bins).astype(int), bins - 1)
-    gaps = [
-        abs(chance[place == b].mean() - right[place == b].mean()) * np.mean(place == b)
-        for b in range(bins)
-        if np.any(place == b)
-    ]
-    return float(sum(gaps))
+def cross_validated(clues: np.ndarray, right: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """The probability of each answer by a fit to the other shapes."""
+    chance = np.zeros(len(right))
+    for fold in range(_FOLDS):
+        held = shape % _FOLDS == fold
+        chance[held] = predict(fit(clues[~held], right[~held]), clues[held])
+    return chance
 
 
-def ranking(chance: np.ndarray, right: np.ndarray) -> float:
-    """Area under the ROC curve: how often a right answer is given more than a wrong one."""
-    above = chance[right][:, None] - chance[~right][None, :]
-    return float(np.mean(above > 0) + np.mean(above == 0) / 2)
+def shipped(name: str, clues: np.ndarray) -> np.ndarray:
+    """The probability of each answer by what ships."""
+    fitted = getattr(calibration, name)
+    weights = [fitted.get(clue, 0.0) for clue in CLUES]
+    return predict(np.array([*weights, fitted["bias"]]), clues)
 
 
 def main() -> None:
-    """Gathers, checks on held-out shapes, fits to all, writes."""
+    """Gathers, then fits or measures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--corpus", required=True, help="HDF5 file of validation shapes")
-    parser.add_argument("--pairs", type=int, default=800)
+    parser.add_argument("--corpus", required=True, help="HDF5 file of shapes")
+    parser.add_argument("--pairs", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=confidence.FITTED)
+    parser.add_argument("--clues", type=Path, help="keep what is gathered in this .npz")
+    parser.add_argument("--fit", action="store_true", help="write cfr_jax/calibration.py")
+    parser.add_argument("--figure", type=Path, help="draw reliability and rejection")
     args = parser.parse_args()
-    clues, right, shapes = gather(read_corpus(args.corpus), args.pairs, args.seed)
-    held = shapes % 2 == 1
-    chance = predict(fit(clues[~held], right[~held]), clues[held])
-    report = {
-        "pairs": len(right),
-        "right": round(float(right.mean()), 3),
-        "held_out_calibration_error": round(calibration_error(chance, right[held]), 3),
-        "held_out_roc_area": round(ranking(chance, right[held]), 3),
-    }
-    fitted = fit(clues, right)
-    weights = {name: round(float(w), 4) for name, w in zip(CLUES, fitted[:-1], strict=True)}
-    content = {"bias": round(float(fitted[-1]), 4), "weights": weights, "fit": report}
-    write_atomically(args.out, (json.dumps(content, indent=2) + "\n").encode())
-    print(json.dumps(content, indent=2))
+    keep_compiled_programs()
+    found = gather(read_corpus(args.corpus), args.pairs, args.seed, args.clues)
+    used = {"REGISTER": OF_NETWORK, "ALIGN": CLUES}
+    chances = {}
+    for (name, clues), right in zip(used.items(), found.right.T, strict=True):
+        columns = found.clues[:, [CLUES.index(clue) for clue in clues]]
+        chances[name] = chance = (
+            cross_validated(columns, right, found.shape) if args.fit else shipped(name, found.clues)
+        )
+        print(name, json.dumps(reliability.summary(chance, right)))
+    if args.fit:
+        _write_calibration(used, found)
+    if args.figure is not None:
+        labels = ("register", "align")
+        curves = zip(labels, chances.values(), found.right.T, strict=True)
+        reliability.draw(args.figure, {label: (c, right) for label, c, right in curves})
+
+
+def _write_calibration(used: dict[str, tuple[str, ...]], found: Gathered) -> None:
+    lines = [confidence.calibration.__doc__.rstrip("\n")]
+    text = f'"""{lines[0]}\n"""\n'
+    for (name, clues), right in zip(used.items(), found.right.T, strict=True):
+        fitted = fit(found.clues[:, [CLUES.index(clue) for clue in clues]], right)
+        text += f'\n{name} = {{\n    "bias": {fitted[-1]:.4f},\n'
+        text += "".join(f'    "{c}": {w:.4f},\n' for c, w in zip(clues, fitted[:-1], strict=True))
+        text += "}\n"
+    write_atomically(Path(calibration.__file__), text.encode())
 
 
 if __name__ == "__main__":

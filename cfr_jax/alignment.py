@@ -5,16 +5,21 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from cfr_jax import confidence, doubts, pyramid, solving
-from cfr_jax.planning import Plan, planned, read_clouds
+from cfr_jax import confidence, doubts, pyramid, quality, refinement, solving
+from cfr_jax.baselines import gicp
+from cfr_jax.baselines.optional import require
+from cfr_jax.planning import Plan, planned, read_clouds, rigid_motions
+from cfr_jax.search import Search, search
 from cfr_jax.weights import load_params
+
+Initial = Float[np.ndarray, "4 4"] | Float[np.ndarray, "k 4 4"] | Literal["global"] | None
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,18 @@ class Alignment:
     """Whether the refinement ended because nothing moved any more; false without one."""
     steps: int = 0
     """How many steps the refinement took."""
+    overlap: float = 0.0
+    """Estimated share of the source that the target saw, too."""
+    information: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
+    """Information matrix of the inliers among the used points, as Open3D's
+    `get_information_matrix_from_point_clouds` gives it: rotation first, about the origin of the
+    target's frame."""
+    initial: Float[np.ndarray, "4 4"] | None = None
+    """Where the network started, in the caller's frame: as given, or as a search found it."""
+    starts: int = 1
+    """How many starts were tried."""
+    alternatives: Float[np.ndarray, "a 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    """Other motions that a search found to fit about as well: the shape is nearly symmetric."""
 
     @property
     def trusted(self) -> bool:
@@ -85,8 +102,11 @@ def align(
     target: Any,
     *,
     params: dict | None = None,
-    refine: bool = True,
-    initial: Float[np.ndarray, "4 4"] | None = None,
+    refine: bool | Literal["small_gicp"] = True,
+    initial: Float[np.ndarray, "4 4"]
+    | Float[np.ndarray, "k 4 4"]
+    | Literal["global"]
+    | None = None,
     max_points: int | None = None,
     all_points: bool = False,
     seed: int = 0,
@@ -96,50 +116,75 @@ def align(
     Clouds are (n, 3) arrays, (n, 6) with normals, paths, or what else `io.as_point_cloud` takes.
     They are centered and scaled in float64, thinned to `max_points` each (default 1,024; `seed`
     says which), given normals where they have none, registered by the network with `params`
-    (default: the weights that ship) and refined (`refinement.refine`; off with `refine=False`).
-    With `all_points` it is refined further on every point there is (`pyramid`); `fitness` and
+    (default: the weights that ship) and refined by `refinement.refine`, by the library small_gicp
+    (`refine="small_gicp"`), or not at all (False). Refining never makes the score worse. With
+    `all_points` it is refined further on every point there is (`pyramid`); `fitness` and
     `inlier_rmse` are then of all points, too.
 
     `initial` (4, 4) moves the source close to the target first; without it the centroids are laid
-    on each other. The network is trained for up to 45 degrees about each axis from there. The same
-    call gives the same answer, to the bit, on the same machine.
+    on each other. The network is trained for up to 45 degrees about each axis from there. Several
+    (k, 4, 4) are all tried on thinned clouds, and the one from which the clouds come to lie best on
+    each other is taken; "global" tries a cover of all rotations (`search`), which takes some
+    times as long, and tells of other motions that fit about as well. The same call gives the same
+    answer, to the bit, on the same machine.
 
     Raises ValueError for clouds without extent or with fewer than 3 points, wrong shapes, values
     that are not finite, and an `initial` that is no rigid motion or leaves the clouds far apart;
-    `io.CloudFileError` for files.
+    `io.CloudFileError` for files; ModuleNotFoundError for small_gicp without that library.
     """
     began = time.perf_counter()
+    if refine not in (True, False, "small_gicp"):
+        raise ValueError(f'refine: got {refine!r}, wanted True, False or "small_gicp"')
+    if refine == "small_gicp":
+        require("small_gicp")  # before anything is computed
     if all_points and not refine:
         raise ValueError(
             "all_points: got True with refine=False, wanted a refinement to go on from"
         )
     source, target = read_clouds(source, target)
-    plan = planned(source, target, initial=initial, max_points=max_points, seed=seed)
     params = checked_params(params)
+    seconds = {"compile": 0.0, "run": 0.0}
+    thinned = {"max_points": max_points, "seed": seed}
+    searched = None
+    if initial is not None:
+        everywhere = isinstance(initial, str) and initial == "global"
+        starts = None if everywhere else rigid_motions(initial)
+        if everywhere or len(starts) > 1:
+            searched = search(params, source, target, starts, **thinned, seconds=seconds)
+            initial = searched.motions[0]
+    plan = planned(source, target, initial=initial, **thinned)
     arguments = params, solving.on_device(plan.source), solving.on_device(plan.target)
-    started = time.perf_counter()
-    program = solving.compiled(solving.solve_pair, *arguments, refine=refine)
-    compiled = time.perf_counter()
-    found = jax.block_until_ready(program(*arguments))
+    solved = solving.timed(seconds, solving.solve_pair, *arguments, refine=refine is True)
+    if refine == "small_gicp":
+        solved = _by_small_gicp(plan, arguments[1:], solved, seconds)
     if all_points:
-        found = pyramid.on_all_points(plan, source, target, found)
-    done = time.perf_counter()
-    seconds = {"compile": compiled - started, "run": done - compiled, "total": done - began}
-    return answer(plan, found, seconds)
+        further = time.perf_counter()
+        solved = pyramid.on_all_points(plan, source, target, solved)
+        seconds["run"] += time.perf_counter() - further
+    seconds["total"] = time.perf_counter() - began
+    return answer(plan, solved, seconds, searched)
 
 
-def answer(plan: Plan, found: solving.Found, seconds: dict[str, float]) -> Alignment:
-    """What the device found of a plan, in the caller's frame and units, and how far to trust it."""
+def answer(
+    plan: Plan, found: solving.Found, seconds: dict[str, float], searched: Search | None = None
+) -> Alignment:
+    """What the device found of a plan, in the caller's frame and units, and how far to trust it.
+
+    `searched` is the search that the plan's start came from, if there was one.
+    """
     frames = plan.frames
+    transform = frames.to_caller(np.asarray(found.transform))
+    initial = None if np.array_equal(frames.initial, np.eye(4)) else frames.initial
+    rivals = np.zeros((0, 4, 4)) if searched is None else searched.rivals(transform)
     resistance = np.asarray(found.quality.resistance)
     determined = bool(resistance.min() >= doubts.FREE)
     weakest = np.asarray(found.quality.weakest)[resistance.argmin()]
     fitness = float(found.quality.fitness)
-    clues = {name: float(value) for name, value in vars(found.clues).items()}
+    clues = {name: float(value) for name, value in confidence.named(found.clues).items()}
     probability = confidence.of_alignment(clues)
     neighbors = min(plan.source.neighbors.shape[1], plan.target.neighbors.shape[1])
     return Alignment(
-        transform=frames.to_caller(np.asarray(found.transform)),
+        transform=transform,
         transforms=frames.to_caller(np.asarray(found.registration.transforms)),
         refined=bool(found.improved),
         converged=bool(found.converged),
@@ -155,9 +200,36 @@ def answer(plan: Plan, found: solving.Found, seconds: dict[str, float]) -> Align
         target_rows=plan.target.rows,
         neighbors=neighbors,
         warnings=doubts.warnings_of(
-            None if determined else weakest, probability, fitness, neighbors, frames.size_ratio
+            None if determined else weakest,
+            doubts.turns(transform, rivals),
+            probability,
+            fitness,
+            neighbors,
+            frames.size_ratio,
         ),
         seconds=seconds,
+        initial=initial,
+        starts=1 if searched is None else searched.starts,
+        alternatives=rivals,
+        overlap=float(found.quality.overlap),
+        information=quality.information_matrix(
+            np.asarray(found.quality.moments), frames.target_center, frames.scale
+        ),
+    )
+
+
+def _by_small_gicp(plan, clouds, solved, seconds):
+    began = time.perf_counter()
+    source, target = (
+        unit.points[unit.mask].astype(np.float64) for unit in (plan.source, plan.target)
+    )
+    start = np.asarray(solved.transform, np.float64)
+    cuts = tuple(stage.cut for stage in refinement.STAGES)
+    found = gicp.descend(source, target, start, cuts)
+    seconds["run"] += time.perf_counter() - began
+    told = jnp.asarray(found.motion, jnp.float32), jnp.array(found.converged)
+    return solving.timed(
+        seconds, solving.replaced, *clouds, solved, *told, jnp.array(found.steps, jnp.int32)
     )
 
 

@@ -1,84 +1,152 @@
-"""The probability that a registration is right, from what it shows of itself."""
+"""The probability that a registration is right, from what it shows of itself.
+
+Right means within 5 degrees and a tenth of the unit sphere's radius. Both probabilities are
+logistic regressions on clues, fitted to validation pairs with the weights that ship
+(`benchmarks/fit_confidence.py`; docs/confidence.md shows how well they hold on others). They are
+nearer the truth the closer one's own data are to those, and mean little for other weights.
+"""
 
 from __future__ import annotations
 
-import functools
-import json
 from collections.abc import Mapping
-from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float
 
-from cfr_jax import rigid
+from cfr_jax import calibration, rigid
 from cfr_jax.quality import Quality
-from cfr_jax.refinement import Surface
-from cfr_jax.registration import Registration
 
-FITTED = Path(__file__).parent / "models" / "confidence.json"
+_HIGHEST = lax.Precision.HIGHEST
+_SURE = 30.0  # larger logits are rounding
 
 
 @struct.dataclass
-class Clues:
-    """What tells right answers from wrong ones; each is a number of order one."""
+class NetworkClues:
+    """What the network alone knows of its answer; each is a number of order one."""
 
-    fitness: Float[Array, ""]
-    distance: Float[Array, ""]
-    """Inlier RMSE, in unit spheres, times 20."""
     source_found: Float[Array, ""]
     """Mean correspondence weight of the source."""
     target_found: Float[Array, ""]
     settled: Float[Array, ""]
-    """How far the network's last iteration still turned: log of degrees + 0.1."""
+    """How far the last iteration still turned: log of degrees + 0.1."""
+    settling: Float[Array, ""]
+    """The same of the iteration before."""
+    residual: Float[Array, ""]
+    """How far the matched places lie from where the answer puts the points: log of the weighted
+    root mean square + 0.01."""
+    sharpness: Float[Array, ""]
+    """Log of how far the matched places spread, over how far their points do: where a match is
+    undecided among many points, it points to the middle of them."""
+    lever: Float[Array, ""]
+    """Log of the spread about the axis that holds a rotation the least: the conditioning of the
+    fit."""
+
+
+@struct.dataclass
+class Clues:
+    """What also the surfaces tell of a refined answer."""
+
+    network: NetworkClues
+    fitness: Float[Array, ""]
+    distance: Float[Array, ""]
+    """Inlier RMSE, in unit spheres, times 20."""
     agreement: Float[Array, ""]
     """How far refinement turned the network's answer: log of degrees + 0.1."""
     resistance: Float[Array, ""]
     """Square root of the weakest resistance to a nudge."""
 
 
+def of_network(
+    transforms: Float[Array, "L 4 4"],
+    source: Float[Array, "n 3"],
+    targets: Float[Array, "n 3"],
+    weights: Float[Array, " n"],
+    covered: Float[Array, " m"],
+    source_mask: Bool[Array, " n"] | None = None,
+    target_mask: Bool[Array, " m"] | None = None,
+) -> NetworkClues:
+    """The clues of the iterations' `transforms` and of the last match: where it put the points of
+    the source (`targets`), and how much of each point of both clouds it found."""
+    share = weights / (jnp.sum(weights) + 1e-5)
+    away = rigid.apply(transforms[-1], source) - targets
+    square = jnp.sum(share * jnp.sum(away * away, axis=1))
+    places, points = (_spread(cloud, share) for cloud in (targets, source))
+    spread, before_it = jnp.trace(places), jnp.trace(points)
+    # the sum of the two smaller eigenvalues, nearly, and exactly on a line
+    twice = spread * spread - jnp.sum(places * places)
+    lever = twice / (2 * spread + 1e-4)
+    # a single iteration has none before it, and counts as settled
+    earlier, before, last = (transforms[max(len(transforms) - back, 0)] for back in (3, 2, 1))
+    return NetworkClues(
+        source_found=_mean(weights, source_mask),
+        target_found=_mean(covered, target_mask),
+        settled=_turned(before, last),
+        settling=_turned(earlier, before),
+        residual=jnp.log(square + 1e-4) / 2,
+        sharpness=jnp.log((spread + 1e-4) / (before_it + 1e-4)) / 2,
+        lever=jnp.log(lever + 1e-4) / 2,
+    )
+
+
 def gather(
-    registration: Registration,
-    source: Surface,
-    target: Surface,
+    network: NetworkClues,
+    found: Float[Array, "4 4"],
     transform: Float[Array, "4 4"],
     quality: Quality,
 ) -> Clues:
-    """The clues of an answer `transform` (source onto target)."""
-
-    def mean(values, mask):
-        valid = mask.astype(values.dtype)
-        return jnp.sum(values * valid) / jnp.maximum(jnp.sum(valid), 1)
-
-    def turned(a, b):
-        return jnp.log(rigid.rotation_error(a, b) + 0.1)
-
-    # a single iteration has none before it, and counts as settled
-    before, last = registration.transforms[-2:][0], registration.transforms[-1]
+    """The clues of an answer `transform`, after a network that `found` another."""
     return Clues(
+        network=network,
         fitness=quality.fitness,
         distance=quality.inlier_rmse * 20,
-        source_found=mean(registration.weights, source.mask),
-        target_found=mean(registration.covered, target.mask),
-        settled=turned(before, last),
-        agreement=turned(last, transform),
+        agreement=_turned(found, transform),
         resistance=jnp.sqrt(jnp.min(quality.resistance)),
     )
 
 
+def named(clues: Clues) -> dict[str, Any]:
+    """All clues by name."""
+    return vars(clues.network) | {k: v for k, v in vars(clues).items() if k != "network"}
+
+
+def of_registration(clues: NetworkClues) -> Float[Array, ""]:
+    """Probability in [0, 1] that the network's own answer is right."""
+    logit = _logit(calibration.REGISTER, vars(clues))
+    return 1 / (1 + jnp.exp(-jnp.clip(logit, -_SURE, _SURE)))
+
+
 def of_alignment(clues: Mapping[str, float]) -> float:
-    """Probability in [0, 1] that an answer with these `Clues`, by name, is right to 5 degrees and
-    0.1 unit radii.
-
-    Logistic regression on the clues, fitted by `benchmarks/fit_confidence.py` to validation pairs
-    with the weights that ship; nearer the truth the closer one's own data are to those.
-    """
-    fitted = _fitted()
-    logit = fitted["bias"] + sum(weight * clues[name] for name, weight in fitted["weights"].items())
-    return float(1 / (1 + np.exp(-np.clip(logit, -30, 30))))
+    """Probability in [0, 1] that an answer with these `Clues`, by name, is right."""
+    logit = _logit(calibration.ALIGN, clues)
+    return float(1 / (1 + np.exp(-np.clip(logit, -_SURE, _SURE))))
 
 
-@functools.cache
-def _fitted():
-    return json.loads(FITTED.read_text())
+def _logit(fitted, clues):
+    return fitted["bias"] + sum(
+        weight * clues[name] for name, weight in fitted.items() if name != "bias"
+    )
+
+
+def _mean(values, mask):
+    if mask is None:
+        return jnp.mean(values)
+    valid = mask.astype(values.dtype)
+    return jnp.sum(values * valid) / jnp.maximum(jnp.sum(valid), 1)
+
+
+def _turned(first, second):
+    """Log of degrees + 0.1; its slope is bounded where motions are equal or half a turn apart."""
+    chord = jnp.sum((first[:3, :3] - second[:3, :3]) ** 2)
+    half_sine = jnp.minimum(jnp.sqrt(chord / 8 + 1e-12), 1 - 1e-6)
+    return jnp.log(jnp.rad2deg(2 * jnp.arcsin(half_sine)) + 0.1)
+
+
+def _spread(points, share):
+    """Covariance of weighted points."""
+    center = jnp.matmul(share, points, precision=_HIGHEST)
+    offset = points - center
+    return jnp.matmul(offset.T, share[:, None] * offset, precision=_HIGHEST)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from cfr_jax.planning import SETTINGS
 
@@ -18,13 +21,14 @@ _SIZES_APART = 5.0  # more than partial views of one thing differ in radius
 
 def warnings_of(
     free: Float[np.ndarray, " 6"] | None,
+    rivals: Sequence[str],
     probability: float,
     fitness: float,
     neighbors: int,
     size_ratio: float,
 ) -> tuple[str, ...]:
-    """`free` is the twist that nothing determines, if there is one; `size_ratio` the radius of the
-    source over that of the target."""
+    """`free` is the twist that nothing determines, if there is one; `rivals` are the turns by which
+    other answers differ (`turns`); `size_ratio` is the radius of the source over the target's."""
     warnings = []
     if not 1 / _SIZES_APART < size_ratio < _SIZES_APART:
         larger, smaller, times = "source", "target", size_ratio
@@ -35,6 +39,8 @@ def warnings_of(
         warnings.append(f"the clouds hardly meet: {fitness:.0%} of the source lies on the target")
     elif free is not None:
         warnings.append(f"the clouds do not determine the motion: they {_describe(free)} freely")
+    if rivals:
+        warnings.append(f"nearly symmetric: fits about as well {' or '.join(rivals)}")
     if probability < TRUSTED:
         warnings.append(
             f"not to be trusted: confidence {probability:.2f}, "
@@ -45,6 +51,18 @@ def warnings_of(
             f"small clouds: {neighbors} neighbors per point instead of {SETTINGS.neighbors}"
         )
     return tuple(warnings)
+
+
+def turns(
+    transform: Float[np.ndarray, "4 4"], others: Float[np.ndarray, "a 4 4"]
+) -> tuple[str, ...]:
+    """By which turns `others` differ from `transform`, about axes of the target's frame."""
+    told = []
+    for other in others:
+        turn = Rotation.from_matrix(other[:3, :3] @ transform[:3, :3].T).as_rotvec(degrees=True)
+        angle = float(np.linalg.norm(turn))
+        told.append(f"turned by {angle:.0f}° about {direction(turn)}" if angle > 1 else "shifted")
+    return tuple(told)
 
 
 def _describe(twist):

@@ -23,7 +23,7 @@ _BUCKETS = tuple(
 )
 _OUTER = 0.995  # this share of the points lies in the unit sphere; stray ones may lie outside
 _STRAY = 4.0  # points so far out are errors of the sensor, and would drown the network
-_FARTHEST = 1e3  # radii between the clouds: float32 holds that with digits to spare
+FARTHEST = 1e3  # radii between the clouds: float32 holds that with digits to spare
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,15 @@ class Frames:
             self.target_center + self.scale * transforms[..., :3, 3] - rotation @ self.source_center
         )
         return moved @ self.initial
+
+    def to_unit(self, motions: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
+        """The other way: motions of the caller's source as motions between the unit clouds."""
+        motions = np.asarray(motions, np.float64) @ np.linalg.inv(self.initial)
+        unit = motions.copy()
+        unit[..., :3, :3] = _orthonormal(motions[..., :3, :3])
+        place = motions[..., :3, :3] @ self.source_center + motions[..., :3, 3]
+        unit[..., :3, 3] = (place - self.target_center) / self.scale
+        return unit
 
 
 @dataclass(frozen=True)
@@ -80,10 +89,10 @@ def unit_frames(
         return Frames(source_center, target_center, scale, np.eye(4), ratio)
     place = initial[:3, :3] @ source_center + initial[:3, 3]
     away = float(np.abs(place - target_center).max())
-    if not away <= _FARTHEST * scale:
+    if not away <= FARTHEST * scale:
         raise ValueError(
             f"initial: leaves the source {away:.3g} away from the target, wanted at most "
-            f"{_FARTHEST * scale:.3g}, which is {_FARTHEST:g} times the radius of the clouds"
+            f"{FARTHEST * scale:.3g}, which is {FARTHEST:g} times the radius of the clouds"
         )
     # What is off by rounding is made a rotation, about the source's center: far from the origin
     # the slightest turn about that would move the cloud.

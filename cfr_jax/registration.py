@@ -19,8 +19,8 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
 
+from cfr_jax import confidence, rigid
 from cfr_jax import neighbors as knn
-from cfr_jax import rigid
 from cfr_jax.features import PairFeature, raw_features
 from cfr_jax.network import CFR
 from cfr_jax.normals import estimate_normals
@@ -85,6 +85,11 @@ class Registration:
     """Annealing: how sharp the match of each iteration was."""
     alpha: Float[Array, " L"]
     """Annealing: how far in feature space it reached."""
+    clues: confidence.NetworkClues
+    """What the confidence was estimated from."""
+    confidence: Float[Array, ""]
+    """Estimated probability, in [0, 1], that `transform` is right to 5 degrees and 0.1; for clouds
+    of unit size and the weights that ship."""
 
     @property
     def transform(self) -> Float[Array, "*batch 4 4"]:
@@ -180,13 +185,25 @@ def _register(params, source, target, *, iterations, settings):
     if not isinstance(target, Encoded):
         target = _encode(params, target, settings=settings)
     steps = list(iterate(params, source, target, iterations, settings))
+    transforms, last = jnp.stack([step.transform for step in steps]), steps[-1].match
+    clues = confidence.of_network(
+        transforms,
+        source.points,
+        last.targets,
+        last.weights,
+        last.covered,
+        source.mask,
+        target.cloud.mask,
+    )
     return Registration(
-        transforms=jnp.stack([step.transform for step in steps]),
-        weights=steps[-1].match.weights,
-        covered=steps[-1].match.covered,
-        targets=steps[-1].match.targets,
+        transforms=transforms,
+        weights=last.weights,
+        covered=last.covered,
+        targets=last.targets,
         beta=jnp.stack([step.affinity.beta for step in steps]),
         alpha=jnp.stack([step.affinity.alpha for step in steps]),
+        clues=clues,
+        confidence=confidence.of_registration(clues),
     )
 
 

@@ -6,6 +6,7 @@ Pure functions of one pair of unit clouds; batches are `vmap`.
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -60,9 +61,37 @@ def solve(params: dict, source: Cloud, target: Encoded, *, refine: bool) -> Foun
         transform = jnp.where(stays, start, refined.transform)
         improved, steps = refined.improved | stays, refined.steps
         converged = refined.converged
-    measured = quality.measure(*surfaces, transform, DISTANCE)
-    clues = confidence.gather(registration, *surfaces, transform, measured)
+    measured, clues = _judge(registration, transform, target.cloud, surfaces)
     return Found(registration, transform, improved, converged, steps, measured, clues)
+
+
+@jax.jit
+def replaced(
+    source: dict[str, jax.Array],
+    target: dict[str, jax.Array],
+    found: Found,
+    transform: Float[Array, "4 4"],
+    converged: Bool[Array, ""],
+    steps: Int[Array, ""],
+) -> Found:
+    """`found` with another refinement's `transform` instead, unless that fits worse."""
+    source, target = (prepare(**cloud, settings=SETTINGS) for cloud in (source, target))
+    surfaces = surface(source), surface(target)
+    before, after = (
+        refinement.score(*surfaces, motion, DISTANCE) for motion in (found.transform, transform)
+    )
+    improved = after <= before
+    transform = jnp.where(improved, transform, found.transform)
+    measured, clues = _judge(found.registration, transform, target, surfaces)
+    return Found(found.registration, transform, improved, converged, steps, measured, clues)
+
+
+def _judge(registration, transform, target, surfaces):
+    spacing = quality.spacing(target.points, target.neighbors, surfaces[1].mask)
+    measured = quality.measure(*surfaces, transform, DISTANCE, spacing)
+    return measured, confidence.gather(
+        registration.clues, registration.transform, transform, measured
+    )
 
 
 def surface(cloud: Cloud) -> Surface:
@@ -88,6 +117,18 @@ def solve_pair(
     """`solve` for two clouds as `on_device` hands them over."""
     source, target = (prepare(**cloud, settings=SETTINGS) for cloud in (source, target))
     return solve(params, source, encode(params, target, settings=SETTINGS), refine=refine)
+
+
+def timed(seconds: dict[str, float], function: Callable, *arguments: Any, **static: Any) -> Any:
+    """What a jitted function answers, when it is there; adds what that took to the `seconds` of
+    "compile" and of "run"."""
+    began = time.perf_counter()
+    program = compiled(function, *arguments, **static)
+    ready = time.perf_counter()
+    answer = jax.block_until_ready(program(*arguments))
+    seconds["compile"] += ready - began
+    seconds["run"] += time.perf_counter() - ready
+    return answer
 
 
 def compiled(function: Callable, *arguments: Any, **static: Any) -> Callable:

@@ -31,6 +31,7 @@ def pytest_sessionstart():
     from cfr_jax.training.step import TrainState
 
     for kind in (
+        confidence.NetworkClues,
         registration.Cloud,
         registration.Encoded,
         registration.Registration,

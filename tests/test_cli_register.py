@@ -181,11 +181,41 @@ def test_the_written_source_lies_on_the_target(pair, tmp_path, answering):
     np.testing.assert_allclose(moved.normals, turned, atol=1e-12)
 
 
+@pytest.mark.parametrize("times", [1, 2])
+def test_each_initial_transform_is_a_start(pair, tmp_path, answering, times):
+    calls = answering()
+    np.savetxt(tmp_path / "initial.txt", cli_samples.motion(5.0))
+
+    code = main(["register", *pair, *["--initial", str(tmp_path / "initial.txt")] * times])
+
+    assert code == 0
+    assert calls[0]["initial"].shape == ((4, 4) if times == 1 else (2, 4, 4))
+
+
+def test_a_global_search_tells_its_start_and_the_other_answers(pair, answering, capsys):
+    calls = answering(initial=cli_samples.motion(90.0), starts=128, alternatives=np.eye(4)[None])
+
+    code = main(["register", *pair, "--global", "--json", "-"])
+
+    document = json.loads(capsys.readouterr().out)
+    jsonschema.validate(document, SCHEMA)
+    assert code == 0 and calls[0]["initial"] == "global"
+    assert (document["starts"], document["alternatives"]) == (128, [np.eye(4).tolist()])
+    np.testing.assert_array_equal(document["initial"], cli_samples.motion(90.0))
+
+
+def test_a_start_and_a_search_are_not_asked_for_together(pair, capsys):
+    code = main(["register", *pair, "--global", "--initial", "a.txt"])
+
+    assert code == 2
+    assert "not allowed with argument" in capsys.readouterr().err
+
+
 def test_pictures_show_the_way_from_the_start_to_the_answer(pair, answering):
     # given
-    answering()
-    source, target = (io.read(path) for path in pair)
     initial = cli_samples.motion(5.0)
+    answering(initial=initial)
+    source, target = (io.read(path) for path in pair)
 
     # when
     scene = report.as_scene(report.register(source, target, initial=initial), {"error": "2 m"})

@@ -148,6 +148,20 @@ def test_euler_angles_and_translations_fill_their_ranges():
     np.testing.assert_allclose(np.linalg.det(motions), 1, atol=1e-6)
 
 
+@pytest.mark.parametrize("legacy", [True, False])
+def test_any_rotation_is_drawn_uniformly(legacy):
+    rng = np.random.RandomState(0) if legacy else np.random.default_rng(0)
+
+    motions = np.array([protocols.random_motion(None, 0.5, rng) for _ in range(4000)], np.float64)
+
+    # of uniform rotations each entry has mean 0 and variance 1/3, the angle mean pi / 2 + 2 / pi
+    rotations = motions[:, :3, :3]
+    np.testing.assert_allclose(rotations.mean(axis=0), 0, atol=0.04)
+    np.testing.assert_allclose(rotations.var(axis=0), 1 / 3, atol=0.02)
+    angle = np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    assert angle.mean() == pytest.approx(np.pi / 2 + 2 / np.pi, abs=0.03)
+
+
 def test_the_same_seed_gives_the_same_pair_and_another_seed_another():
     shape = corpus_of()[0]
 

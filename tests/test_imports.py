@@ -19,19 +19,21 @@ LAYERS = (
     ("layers",),
     ("rigid", "neighbors", "normals", "features", "sinkhorn", "extraction", "pooling"),
     ("network",),
-    ("registration", "refinement"),
-    ("rpmnet",),
+    ("refinement", "calibration"),
     ("quality",),
+    ("confidence",),
+    ("registration",),
+    ("rpmnet",),
     ("losses", "metrics", "weights", "progress", "cards", "export"),
     ("convert",),
     ("io",),
     ("data", "viewer"),
     ("baselines",),
-    ("preparation", "confidence"),
+    ("preparation", "rotations"),
     ("training",),
     ("planning",),
     ("solving", "doubts"),
-    ("pyramid",),
+    ("search", "pyramid"),
     ("alignment",),
     ("batch",),
     ("reproduction",),
@@ -46,7 +48,7 @@ KNOWS_ONLY = {
     "data": {"io", "neighbors", "progress"},
     "metrics": set(),
 }
-NUMERICAL_CORE = {name for layer in LAYERS[:6] for name in layer} | {"losses"}
+NUMERICAL_CORE = {name for layer in LAYERS[:9] for name in layer} | {"losses"}
 # Arrays in, arrays out: no files, no configuration, no host program around it.
 CORE_MAY_USE = {
     "__future__", "collections", "dataclasses", "functools", "math", "typing",

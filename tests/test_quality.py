@@ -16,8 +16,8 @@ from cfr_jax.normals import estimate_normals
 from cfr_jax.preparation import to_unit, unit_frames
 from cfr_jax.refinement import Surface
 
-SIZE, DISTANCE = 512, 0.05
-MEASURE = jax.jit(functools.partial(quality.measure, distance=DISTANCE))
+SIZE, DISTANCE, SPACING = 512, 0.05, jnp.array(0.03)
+MEASURE = jax.jit(functools.partial(quality.measure, distance=DISTANCE, spacing=SPACING))
 SHAPES = {
     "plane": solids.plane,
     "sphere": solids.sphere,
@@ -66,6 +66,32 @@ def test_fitness_and_rmse_are_those_of_a_kd_tree(degrees):
     inlier = away <= DISTANCE
     assert abs(found.fitness - inlier.mean()) < 1.5 / len(source)
     np.testing.assert_allclose(found.inlier_rmse, np.sqrt(np.mean(away[inlier] ** 2)), rtol=2e-2)
+    assert abs(found.overlap - np.mean(away <= 2 * SPACING)) < 1.5 / len(source)
+
+
+def test_the_information_matrix_is_the_sum_over_the_inliers_in_the_callers_frame():
+    source, target = solids.lopsided(430, 0).points, solids.lopsided(500, 1).points
+    center, scale = np.array([300.0, -20.0, 5.0]), 2.5
+    clouds = [np.asarray(s.points)[np.asarray(s.mask)] for s in surfaces(source, target)]
+
+    found = quality.information_matrix(measured(source, target).moments, center, scale)
+
+    away, row = cKDTree(clouds[1]).query(clouds[0])
+    wanted = np.zeros((6, 6))
+    for x, y, z in center + scale * clouds[1][row[away <= DISTANCE]]:
+        jacobian = np.array([[0, z, -y, 1, 0, 0], [-z, 0, x, 0, 1, 0], [y, -x, 0, 0, 0, 1]])
+        wanted += jacobian.T @ jacobian
+    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-3 * np.abs(wanted).max())
+
+
+def test_the_spacing_is_the_median_distance_to_the_nearest_neighbor():
+    points = solids.lopsided(100, 0).points.astype(np.float32)
+    neighbors = cKDTree(points).query(points, 5)[1][:, 1:]
+
+    found = quality.spacing(*map(jnp.asarray, (points, neighbors, np.arange(100) < 90)))
+
+    wanted = np.median(cKDTree(points).query(points, 2)[0][:90, 1])
+    np.testing.assert_allclose(found, wanted, rtol=1e-5)
 
 
 def test_clouds_out_of_reach_have_no_fitness_no_error_and_nothing_that_holds_them():
@@ -135,3 +161,21 @@ def test_the_weakest_directions_are_the_free_ones(shape):
 
     overlap = np.linalg.svd(found @ expected.T)[1]
     assert overlap.min() > 0.9
+
+
+def test_the_information_matrix_is_open3ds():
+    o3d = pytest.importorskip("open3d")
+    source, target = (solids.lopsided(500, seed).points + [3.0, -2.0, 1.0] for seed in (0, 1))
+    frames = unit_frames(PointCloud(target), PointCloud(target), None)
+    moments = measured(source, target).moments
+
+    found = quality.information_matrix(moments, frames.target_center, frames.scale)
+
+    clouds = (
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (source, target)
+    )
+    wanted = o3d.pipelines.registration.get_information_matrix_from_point_clouds(
+        *clouds, DISTANCE * frames.scale, np.eye(4)
+    )
+    # a pair whose distance rounds across the limit may count on one side only
+    np.testing.assert_allclose(found, wanted, atol=2e-2 * np.abs(wanted).max())

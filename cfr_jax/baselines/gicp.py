@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -25,14 +25,35 @@ def register(
 
     The covariance of a point comes from its `neighbors` nearest points; normals are not used.
     """
+    motion = initial(source, target, start)
+    return descend(source.points, target.points, motion, distances, neighbors, iterations).motion
+
+
+class Descent(NamedTuple):
+    """Where it ended, whether the last stage settled there, and how many steps all took."""
+
+    motion: Float[np.ndarray, "4 4"]
+    converged: bool
+    steps: int
+
+
+def descend(
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "m 3"],
+    motion: Float[np.ndarray, "4 4"],
+    distances: tuple[float, ...],
+    neighbors: int = 20,
+    iterations: int = 100,
+) -> Descent:
+    """GICP from `motion`, which maps source onto target."""
     small_gicp = require("small_gicp")
     clouds, trees = zip(
-        *(_with_covariances(cloud.points, neighbors) for cloud in (source, target)), strict=True
+        *(_with_covariances(points, neighbors) for points in (source, target)), strict=True
     )
-    motion = initial(source, target, start)
+    converged, steps = False, 0
     for distance in distances:
         # small_gicp's usual tolerances are those of a car: 0.1 degrees and a millimeter
-        motion = small_gicp.align(
+        found = small_gicp.align(
             clouds[1],
             clouds[0],
             trees[1],
@@ -42,8 +63,10 @@ def register(
             max_iterations=iterations,
             rotation_epsilon=1e-5,
             translation_epsilon=1e-5 * distance,
-        ).T_target_source
-    return np.array(motion)
+        )
+        motion, converged = np.array(found.T_target_source), bool(found.converged)
+        steps += int(found.iterations)
+    return Descent(np.array(motion), converged, steps)
 
 
 def _with_covariances(points: Float[np.ndarray, "n 3"], neighbors: int) -> tuple[Any, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -27,9 +28,11 @@ files:
 what the quality means:
   fitness         share of the source's points that lie within the inlier distance of the target
   inlier RMSE     root mean square distance of those points, in the files' unit
+  overlap         share of the source that the target saw, too, as far as one can tell
   confidence      probability, 0 to 1, that the motion is right to 5 degrees and a tenth of the
                   clouds' radius
   not determined  the shapes leave a motion open (a plane on a plane, a line, a sphere)
+  nearly symmetric  (--global) the clouds fit about as well in another position, which is named
   not trusted     not determined, or more likely wrong than right: do not use it unchecked
 
 examples:
@@ -38,6 +41,7 @@ examples:
   cfr register a.pcd b.las --json - | jq .transform    use it in a script
   cfr register a.ply b.ply --view page.html            turn the result in a browser
   cfr register a.ply b.ply --initial previous.json     start from an earlier answer
+  cfr register a.ply b.ply --global                    if they may be turned by any angle
   cfr register a.ply b.ply --strict || echo "look at it"
 """
 
@@ -81,22 +85,38 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
 
     how = parser.add_argument_group("how to register")
-    how.add_argument(
+    after = how.add_mutually_exclusive_group()
+    after.add_argument(
         "--no-refine",
         action="store_true",
         help="take the network's own answer, without the local refinement after it",
+    )
+    after.add_argument(
+        "--refine",
+        choices=("own", "small_gicp"),
+        default="own",
+        help="what refines it: our own generalized ICP (the default), or that of the library "
+        'small_gicp (pip install "cfr_jax[baselines]")',
     )
     how.add_argument(
         "--weights",
         metavar="W",
         help="weights of the network: a name that ships with the package, or a .safetensors file",
     )
-    how.add_argument(
+    where = how.add_mutually_exclusive_group()
+    where.add_argument(
         "--initial",
         metavar="T",
         type=Path,
+        action="append",
         help="move the source by this 4x4 matrix first: .txt with 16 numbers, .npy, or .json (a "
-        "matrix, or what --json wrote); the answer includes it",
+        "matrix, or what --json wrote); the answer includes it; given several times, all are tried",
+    )
+    where.add_argument(
+        "--global",
+        dest="everywhere",
+        action="store_true",
+        help="search all rotations; without it, up to about 45 degrees about each axis are found",
     )
     how.add_argument(
         "--max-points",
@@ -128,10 +148,15 @@ def run(args: argparse.Namespace) -> int:
     to_stdout = args.json == Path("-")
     _check_outputs(args, to_stdout)
 
+    import numpy as np
+
     from cfr_jax import io
     from cfr_jax.cli.transforms import read_transform
 
-    initial = None if args.initial is None else read_transform(args.initial)
+    initial = "global" if args.everywhere else None
+    if args.initial is not None:
+        motions = [read_transform(path) for path in args.initial]
+        initial = motions[0] if len(motions) == 1 else np.stack(motions)
     source, target = io.read(args.source, seed=args.seed), io.read(args.target, seed=args.seed)
 
     from cfr_jax.cli import report
@@ -142,7 +167,7 @@ def run(args: argparse.Namespace) -> int:
         source,
         target,
         weights=args.weights,
-        refine=not args.no_refine,
+        refine="small_gicp" if args.refine == "small_gicp" else not args.no_refine,
         initial=initial,
         max_points=args.max_points,
         all_points=args.all_points,
@@ -176,8 +201,10 @@ def _check_outputs(args: argparse.Namespace, to_stdout: bool) -> None:
     given = {option: (path, ends) for option, (path, ends) in wanted.items() if path is not None}
     for option, (path, suffixes) in given.items():
         outputs.check_output(option, path, suffixes)
-    inputs = [path for path in (args.source, args.target, args.initial) if path is not None]
+    inputs = [path for path in (args.source, args.target, *(args.initial or ()))]
     outputs.check_apart(inputs, [path for path, _ in given.values()])
+    if args.refine == "small_gicp" and importlib.util.find_spec("small_gicp") is None:
+        raise ValueError('--refine small_gicp needs that library: pip install "cfr_jax[baselines]"')
     if args.png is not None:
         outputs.check_library("--png", args.png)
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
 from cfr_jax import __version__
-from cfr_jax.alignment import Alignment, align
+from cfr_jax.alignment import Alignment, Initial, align
 from cfr_jax.io import PointCloud
 from cfr_jax.viewer import Scene
 from cfr_jax.weights import DEFAULT, Weights, read_weights
@@ -42,8 +42,8 @@ def register(
     target: PointCloud,
     *,
     weights: str | None = None,
-    refine: bool = True,
-    initial: Float64[np.ndarray, "4 4"] | None = None,
+    refine: bool | Literal["small_gicp"] = True,
+    initial: Initial = None,
     max_points: int | None = None,
     all_points: bool = False,
     seed: int = 0,
@@ -60,7 +60,7 @@ def register(
         all_points=all_points,
         seed=seed,
     )
-    return Result(source, target, initial, seed, chosen, alignment)
+    return Result(source, target, alignment.initial, seed, chosen, alignment)
 
 
 def as_document(result: Result, source_path: str, target_path: str) -> dict[str, Any]:
@@ -74,13 +74,19 @@ def as_document(result: Result, source_path: str, target_path: str) -> dict[str,
         "transform": found.transform.tolist(),
         "transforms": found.transforms.tolist(),
         "initial": None if result.initial is None else result.initial.tolist(),
+        "starts": found.starts,
+        "alternatives": found.alternatives.tolist(),
         "refined": found.refined,
+        "converged": found.converged,
+        "steps": found.steps,
         "trusted": found.trusted,
         "determined": found.determined,
         "confidence": found.confidence,
         "fitness": found.fitness,
         "inlier_rmse": found.inlier_rmse,
         "inlier_distance": found.inlier_distance,
+        "overlap": found.overlap,
+        "information": found.information.tolist(),
         "warnings": list(found.warnings),
         "neighbors": found.neighbors,
         "seed": result.seed,

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
+from scipy.spatial.transform import Rotation
 
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.pairs import Pair
@@ -35,7 +36,7 @@ class Protocol:
     points: int = 1024  # of a whole shape; a cropped cloud has ceil(keep * points)
     keep: float | None = None  # share of the shape that a crop leaves
     noise: bool = True  # N(0, 0.01), clipped to 0.05
-    angle: float = 45.0  # degrees; each Euler angle is drawn from [0, angle]
+    angle: float | None = 45.0  # degrees; each Euler angle from [0, angle]; None: any rotation
     translation: float = 0.5  # each coordinate is drawn from [-translation, translation]
 
     def __post_init__(self):
@@ -49,6 +50,7 @@ clean = Protocol("clean", noise=False)
 noise = Protocol("noise")
 partial = Protocol("partial", keep=0.7)
 low_overlap = Protocol("low_overlap", keep=0.5)
+partial_any_rotation = Protocol("partial_any_rotation", keep=0.7, angle=None)
 
 
 def fixed_pair(corpus: Corpus, index: int, protocol: Protocol) -> Pair:
@@ -110,14 +112,20 @@ def crop(points: Float[np.ndarray, "p 3"], keep: float, rng: Rng) -> Int[np.ndar
     return kept
 
 
-def random_motion(angle: float, translation: float, rng: Rng) -> Float32[np.ndarray, "4 4"]:
-    """R = Rx Ry Rz with each angle in [0, angle] degrees, then a translation within a cube."""
-    x, y, z = (rng.uniform() * np.pi * angle / 180.0 for _ in range(3))
-    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
-    about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
-    about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
+def random_motion(angle: float | None, translation: float, rng: Rng) -> Float32[np.ndarray, "4 4"]:
+    """R = Rx Ry Rz with each angle in [0, angle] degrees, then a translation within a cube.
+
+    Without an angle the rotation is any, uniform over SO(3): that of a random unit quaternion.
+    """
     motion = np.eye(4)
-    motion[:3, :3] = about_x @ about_y @ about_z
+    if angle is None:
+        motion[:3, :3] = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    else:
+        x, y, z = (rng.uniform() * np.pi * angle / 180.0 for _ in range(3))
+        about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
+        about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
+        about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
+        motion[:3, :3] = about_x @ about_y @ about_z
     motion[:3, 3] = rng.uniform(-translation, translation, 3)
     return motion.astype(np.float32)
 

@@ -18,7 +18,13 @@ from cfr_jax.data.pairs import Pair, open_pairs
 
 _PROTOCOLS = {
     made.name: made
-    for made in (protocol.clean, protocol.noise, protocol.partial, protocol.low_overlap)
+    for made in (
+        protocol.clean,
+        protocol.noise,
+        protocol.partial,
+        protocol.low_overlap,
+        protocol.partial_any_rotation,
+    )
 }
 Make = Callable[[int], Pair]
 # What `data.layout` recognizes, as the kinds of a config, and a config that has all their settings.

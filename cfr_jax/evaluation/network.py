@@ -53,6 +53,7 @@ def make_network(
     batch: int = 1,
     vectorized: int = 1,
     max_points: int | None = None,
+    initial: Literal["global"] | None = None,
     seed: int = 0,
 ) -> Solver:
     """A network of `KINDS` with these weights, `settings` other than its usual ones, with or
@@ -60,8 +61,9 @@ def make_network(
 
     "register" takes the clouds as they are, `batch` pairs a call, `vectorized` of them at a time
     (one keeps a CPU's caches warm, an accelerator wants many); the time of a pair is its share of
-    the call's. "align" (CFR only) is `align`, pair by pair, with its `max_points` and `seed`;
-    "preparation" brings clouds to the network's size and place as `align` does, for any network.
+    the call's. "align" (CFR only) is `align`, pair by pair, with its `max_points`, `initial` and
+    `seed`; "preparation" brings clouds to the network's size and place as `align` does, for any
+    network.
     """
     if through not in ("register", "align", "preparation"):
         raise ValueError(f"through is {through!r}, wanted 'register', 'align' or 'preparation'")
@@ -70,8 +72,16 @@ def make_network(
         if network != "cfr" or settings:
             raise ValueError("through 'align' is CFR as it is; wanted 'preparation' for others")
         return functools.partial(
-            _align_each, params, refine, estimated, max_points=max_points, seed=seed
+            _align_each,
+            params,
+            refine,
+            estimated,
+            max_points=max_points,
+            initial=initial,
+            seed=seed,
         )
+    if initial is not None:
+        raise ValueError(f"initial is {initial!r}, which needs through='align'")
     unroll, made = KINDS[network]
     program = Program(unroll, made(**settings or {}), refine, vectorized)
     if through == "preparation":

@@ -1,0 +1,86 @@
+"""How far probabilities hold: calibration, ranking, and the two pictures of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+_BINS = 10
+_RESAMPLED = 1000
+
+
+def calibration_error(chance: np.ndarray, right: np.ndarray, bins: int = _BINS) -> float:
+    """Expected calibration error over bins of equal width."""
+    return float(sum(abs(said - was) * share for said, was, share in _bins(chance, right, bins)))
+
+
+def ranking(chance: np.ndarray, right: np.ndarray) -> float:
+    """Area under the ROC curve: how often a right answer is given more than a wrong one."""
+    above = chance[right][:, None] - chance[~right][None, :]
+    return float(np.mean(above > 0) + np.mean(above == 0) / 2)
+
+
+def summary(chance: np.ndarray, right: np.ndarray) -> dict[str, float | int | list[float]]:
+    """Both figures with 95% intervals from resampled pairs, and what trusting at 0.5 gives."""
+    rng = np.random.default_rng(0)
+    areas = []
+    for _ in range(_RESAMPLED):
+        rows = rng.integers(len(right), size=len(right))
+        if 0 < right[rows].sum() < len(rows):
+            areas.append(ranking(chance[rows], right[rows]))
+    # what a perfectly calibrated probability would show on so few pairs, by chance alone
+    perfect = [calibration_error(chance, rng.random(len(chance)) < chance) for _ in range(200)]
+    trusted = chance >= 0.5
+    return {
+        "pairs": len(right),
+        "right": round(float(right.mean()), 3),
+        "calibration_error": round(calibration_error(chance, right), 3),
+        "calibration_error_by_chance": round(float(np.mean(perfect)), 3),
+        "roc_area": round(ranking(chance, right), 3),
+        "roc_area_95": [round(float(v), 3) for v in np.quantile(areas, [0.025, 0.975])],
+        "trusted": round(float(trusted.mean()), 3),
+        "right_of_trusted": round(float(right[trusted].mean()), 3),
+        "right_of_untrusted": round(float(right[~trusted].mean()), 3),
+    }
+
+
+def draw(path: Path, curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """The reliability diagram, and the rejection curve: of the answers kept when the least certain
+    are thrown away, the share that is wrong."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    reliable, rejecting = figure.subplots(1, 2)
+    for label, (chance, right) in curves.items():
+        said, was, share = np.array(list(_bins(chance, right, _BINS))).T
+        error, area = calibration_error(chance, right), ranking(chance, right)
+        reliable.plot(said, was, alpha=0.6, lw=1)
+        reliable.scatter(
+            said, was, s=20 + 600 * share, alpha=0.6, label=f"{label}, {error:.3f} off"
+        )
+        kept = np.arange(1, len(right) + 1)
+        wrong = np.cumsum(~right[np.argsort(-chance)]) / kept
+        rejecting.plot(kept / len(right), wrong, label=f"{label}, ROC area {area:.3f}")
+    reliable.plot([0, 1], [0, 1], color="gray", lw=1, ls="--")
+    reliable.set(xlabel="confidence", ylabel="share that was right", title="Reliability")
+    rejecting.set(
+        xlabel="share of the answers kept, most confident first",
+        ylabel="share of those that is wrong",
+        title="Rejection",
+        xlim=(0, 1),
+    )
+    for axes in (reliable, rejecting):
+        axes.legend(frameon=False, loc="upper left")
+        axes.grid(alpha=0.3)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+
+
+def _bins(chance, right, bins):
+    """Mean confidence, share right, and share of all pairs, of each bin that is not empty."""
+    place = np.minimum((chance * bins).astype(int), bins - 1)
+    for b in range(bins):
+        here = place == b
+        if here.any():
+            yield chance[here].mean(), right[here].mean(), here.mean()
