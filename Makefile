@@ -3,7 +3,7 @@
 #   make test       the tests; make test-slow: those that take minutes
 #   make lint       ruff and mypy
 #   make coverage   the tests, and how much of the package they reach
-#   make bench      measure speed
+#   make bench      measure speed; BENCH="--quick --minutes 10" for a short one
 #   make docs       the site, into out/docs
 
 SHELL := /bin/bash
@@ -12,6 +12,7 @@ SHELL := /bin/bash
 .PHONY: demo test test-slow lint format coverage bench docs clean
 
 PYTHON ?=
+BENCH ?=
 BIN := .venv/bin
 RUNNABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 
@@ -37,7 +38,7 @@ format: .venv/.dev
 	$(BIN)/ruff format .
 
 bench: .venv/.dev
-	$(BIN)/python benchmarks/speed.py
+	$(BIN)/python benchmarks/run.py $(BENCH)
 
 docs: .venv/.dev
 	$(BIN)/python -m sphinx -b html -W --keep-going -q docs out/docs
