@@ -3,7 +3,7 @@
 #   make test       the tests; make test-slow: those that take minutes
 #   make lint       ruff and mypy
 #   make coverage   the tests, and how much of the package they reach
-#   make bench      measure speed; BENCH="--quick --minutes 10" for a short one
+#   make bench      measure speed; BENCH="--quick --minutes 8" for a short one
 #   make docs       the site, into out/docs
 
 SHELL := /bin/bash

@@ -74,6 +74,10 @@ def tables(told: dict) -> str:
             own = m["peak"] - m["imports"]
             parts.append(f"| {m['points']:,} | {m['peak']:.0f} | {own:.0f} | {model:.0f} |")
         parts.append("")
+    parts.append(
+        "![Time against points](../../docs/images/speed_sizes.png)\n\n"
+        "![Where the time of a pair goes](../../docs/images/speed_modules.png)\n"
+    )
     if told["left_out"]:
         parts.append(
             "Left out, for time or because it failed: " + "; ".join(told["left_out"]) + ".\n"
@@ -126,7 +130,7 @@ def _draw_sizes(told, path):
     if not whole:
         return
     counts = np.array([line["points"] for line in whole])
-    grid = np.geomspace(counts.min(), counts.max(), 50)
+    grid = np.geomspace(counts.min(), max(counts.max(), 12000), 50)
     reach = whole[0]["share"] * whole[0]["roof"] * 1e9
     parts = {
         "features": lambda n: 2 * cost.features(n),

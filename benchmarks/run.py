@@ -74,20 +74,23 @@ def main() -> None:
         lines.append(line)
         _print(line)
     lines += list(_peers(args, roof, clock))
-    told["start_up"] = None
+    told |= {"start_up": None, "memory": []}
+    _save(told, lines, args.out, began)  # what follows starts other processes, and may be stopped
     if clock.has(2 * RESERVE, "start-up"):
-        told["start_up"] = children.start_up(args.runs if not args.quick else 5)
+        told["start_up"] = children.start_up(5 if args.quick else args.runs)
         print(f"start-up {told['start_up']}")
-    told["memory"] = []
     for count in (*(QUICK[::2] if args.quick else SIZES), *(LONG if args.long else ())):
         if clock.has(2 * RESERVE, f"memory at {count} points"):
             told["memory"].append(children.peak_memory(count, timeout=max(60.0, clock.left())))
             print(f"memory {told['memory'][-1]}")
+    _save(told, lines, args.out, began)
+    report.write(told, args.out, args.images)
+
+
+def _save(told: dict, lines: list[Line], out: Path, began: float) -> None:
     told["seconds"] = time.monotonic() - began
     told["lines"] = [line.as_dict() for line in lines]
-    text = json.dumps(told, indent=1) + "\n"
-    (args.out / "speed.json").write_text(text, encoding="utf-8")
-    report.write(told, args.out, args.images)
+    (out / "speed.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
 
 
 def planned(args: argparse.Namespace) -> Iterator[cases.Case]:
