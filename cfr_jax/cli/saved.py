@@ -16,7 +16,7 @@ from cfr_jax.io import PointCloud
 from cfr_jax.viewer import Scene
 
 _LARGEST_FILE = 1 << 26  # bytes; a result has a few thousand
-_NEEDED = {
+_NEEDED: dict[str, type | tuple[type, ...]] = {
     "source": dict,
     "target": dict,
     "transform": list,
@@ -102,7 +102,7 @@ def as_scene(document: dict[str, Any], source: PointCloud, target: PointCloud) -
         scene = Scene(
             source=source.points,
             target=target.points,
-            transforms=stations,
+            transforms=np.asarray(stations, np.float64),
             labels=labels,
             facts=facts,
             source_name=source.name,
