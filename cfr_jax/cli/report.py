@@ -153,7 +153,7 @@ def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
 
 def way(
     initial: ArrayLike | None, transforms: ArrayLike, refined: ArrayLike | None
-) -> tuple[list[ArrayLike], list[str]]:
+) -> tuple[list[Any], list[str]]:
     """The stations of the motion, each (4, 4), and what they are called."""
     stations = [np.eye(4) if initial is None else initial, *transforms]
     labels = ["start", *(f"iteration {i}" for i in range(1, len(stations)))]

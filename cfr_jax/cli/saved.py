@@ -102,7 +102,7 @@ def as_scene(document: dict[str, Any], source: PointCloud, target: PointCloud) -
         scene = Scene(
             source=source.points,
             target=target.points,
-            transforms=np.asarray(stations, np.float64),
+            transforms=stations,
             labels=labels,
             facts=facts,
             source_name=source.name,
