@@ -233,7 +233,7 @@ def _by_small_gicp(plan, clouds, solved, seconds):
     )
 
 
-def checked_params(params: Any) -> dict:
+def checked_params(params: Any) -> Mapping:
     """The weights that ship for None; raises ValueError for what are no parameters."""
     params = _default_params() if params is None else params
     if not isinstance(params, Mapping):

@@ -8,6 +8,7 @@ over some thousand pairs at a time, so memory grows with the clouds and nothing 
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -73,11 +74,13 @@ def on_all_points(plan: Plan, source: PointCloud, target: PointCloud, found: Fou
         np.asarray(found.transform, np.float64),
         thinned_to=max(len(plan.source.rows), len(plan.target.rows)),
     )
-    quality = found.quality.replace(
+    quality = dataclasses.replace(
+        found.quality,
         fitness=jnp.asarray(fine.fitness, jnp.float32),
         inlier_rmse=jnp.asarray(fine.inlier_rmse, jnp.float32),
     )
-    return found.replace(
+    return dataclasses.replace(
+        found,
         transform=jnp.asarray(fine.transform, jnp.float32),
         improved=found.improved | fine.improved,
         converged=jnp.asarray(fine.converged),

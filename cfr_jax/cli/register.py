@@ -7,6 +7,7 @@ import importlib.util
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from cfr_jax.cli import outputs
 
@@ -153,7 +154,7 @@ def run(args: argparse.Namespace) -> int:
     from cfr_jax import io
     from cfr_jax.cli.transforms import read_transform
 
-    initial = "global" if args.everywhere else None
+    initial: Any = "global" if args.everywhere else None
     if args.initial is not None:
         motions = [read_transform(path) for path in args.initial]
         initial = motions[0] if len(motions) == 1 else np.stack(motions)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -100,7 +100,7 @@ def as_text(result: Result) -> str:
     found = result.alignment
     rotation, translation = found.transform[:3, :3], found.transform[:3, 3]
     # by the chord |R - 1|: scipy's rotations take a twelfth of the command's time to import
-    chord = np.linalg.norm(rotation - np.eye(3))
+    chord = float(np.linalg.norm(rotation - np.eye(3)))
     angle = np.degrees(2 * np.arcsin(min(chord / 8**0.5, 1.0)))
     verdict = "trusted" if found.trusted else "not trusted"
     if not found.determined:
@@ -152,7 +152,7 @@ def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
 
 
 def way(
-    initial: ArrayLike | None, transforms: ArrayLike, refined: ArrayLike | None
+    initial: ArrayLike | None, transforms: Iterable[ArrayLike], refined: ArrayLike | None
 ) -> tuple[list[Any], list[str]]:
     """The stations of the motion, each (4, 4), and what they are called."""
     stations = [np.eye(4) if initial is None else initial, *transforms]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 
 from cfr_jax import network, registration, rpmnet
 from cfr_jax.training.step import Unroll
+
+AnySettings = registration.Settings | rpmnet.Settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,9 +20,9 @@ class Learner:
 
     fresh: Callable[[jax.Array], dict]
     unroll: Unroll
-    trained: Callable[[int], Hashable]
+    trained: Callable[[int], AnySettings]
     """Settings by the number of neighbors."""
-    validated: Hashable
+    validated: AnySettings
 
 
 @dataclasses.dataclass(frozen=True)

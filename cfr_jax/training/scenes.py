@@ -10,6 +10,7 @@ import functools
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -65,6 +66,7 @@ def pairs_source(path: str | Path, frames: Frames = None) -> SceneSource:
     `frames` goes by the attributes `source_frame` and `target_frame` of the groups of HDF5.
     """
     held = open_pairs(path)
+    tokens: tuple[tuple[Any, ...], ...]
     if isinstance(held, Hdf5Pairs):
         tokens = tuple(held.frames(i) for i in range(len(held)))
     else:

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ def fixed_pairs(mixture: Mixture, count: int, points: int, neighbors: int, radiu
     return {key: np.stack([pair[key] for pair in pairs]) for key in pairs[0]}
 
 
-def _protocol_pair(source: Source, index: int, neighbors: int, radius: float) -> dict:
+def _protocol_pair(source: Any, index: int, neighbors: int, radius: float) -> dict:
     pair = protocol.fixed_pair(source.corpus, index, protocol.partial)
     made = {"transform": pair.transform, "estimate_normals": False}
     for side in ("source", "target"):
@@ -112,7 +113,7 @@ def _named(given, where):
 
 
 def _open(kind, about, cache, where):
-    makers = {
+    makers: dict[str, Callable[..., Source]] = {
         "shapes": lambda path: ShapeSource(read_corpus(path)),
         "pairs": scenes.pairs_source,
         "kitti": lambda path, **rest: scenes.kitti_source(path, cache=cache, **rest),
