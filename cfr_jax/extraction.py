@@ -29,6 +29,7 @@ from jaxtyping import Array, Bool, Float
 from cfr_jax.batching import cloud_by_cloud
 from cfr_jax.layers import Layer, fold, norm_of, projections
 
+_HIGHEST = lax.Precision.HIGHEST  # for what becomes a variance
 # Rows of 96 floats in flight, so that a tile's activations stay in a cache: two or three of them at
 # a time forward, about eight backward.
 _FORWARD_ROWS = 8192
@@ -184,7 +185,8 @@ def _backward(residuals, gradient, *, groups):
     flat_one, tilt_one = projections(one, shift_one, scale_one, rows, groups)
     flat_raw = raw.reshape(-1, channels)
     weight = jnp.repeat(valid, k)[:, None]
-    total, gram = (weight * flat_raw).sum(0), (weight * flat_raw).T @ flat_raw
+    total = (weight * flat_raw).sum(0)
+    gram = jnp.matmul((weight * flat_raw).T, flat_raw, precision=_HIGHEST)
     dense_outer = jnp.outer(total, flat_one + tilt_one * offset) + gram @ (slope * tilt_one)
     kernel_one = (outer * one.scale - dense_outer) * norm_one.rate
     dense_sum = rows * (flat_one + tilt_one * offset) + total @ (slope * tilt_one)
@@ -228,7 +230,7 @@ def _moments_of_first(layer, tiles, valid, rows):
     def add(gram, tile):
         raw, weight = tile
         centered = ((raw - mean) * weight[:, None, None]).reshape(-1, channels)
-        return gram + centered.T @ centered, None
+        return gram + jnp.matmul(centered.T, centered, precision=_HIGHEST), None
 
     gram, _ = lax.scan(add, jnp.zeros((channels, channels), tiles.dtype), (each, weights))
     covariance = gram / rows

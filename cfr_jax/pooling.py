@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from cfr_jax.layers import Layer, norm_of, projections
 
+_HIGHEST = lax.Precision.HIGHEST  # for what becomes a variance
 _TILE_ROWS = 1 << 14  # 64 MiB of 1,024 channels; clouds of the usual size are one tile
 
 
@@ -42,7 +43,7 @@ def _forward(layer, x, valid, groups):
     count = jnp.maximum(jnp.sum(valid), 1)
     mean = valid @ x / count
     centered = (x - mean) * valid[:, None]
-    covariance = centered.T @ centered / count
+    covariance = jnp.matmul(centered.T, centered, precision=_HIGHEST) / count
     channel_mean = mean @ layer.kernel + layer.bias
     norm = norm_of(channel_mean, ((covariance @ layer.kernel) * layer.kernel).sum(0), groups)
     # for a negative scale the smallest value becomes the largest
