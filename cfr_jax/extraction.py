@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float
 from cfr_jax.batching import cloud_by_cloud
 from cfr_jax.layers import Layer, fold, norm_of, projections
 
-_HIGHEST = lax.Precision.HIGHEST  # for what becomes a variance
+_HIGHEST = lax.Precision.HIGHEST  # for what becomes a variance, and for the raw channels
 # Rows of 96 floats in flight, so that a tile's activations stay in a cache: two or three of them at
 # a time forward, about eight backward.
 _FORWARD_ROWS = 8192
@@ -192,7 +192,8 @@ def _backward(residuals, gradient, *, groups):
     dense_sum = rows * (flat_one + tilt_one * offset) + total @ (slope * tilt_one)
     bias_one = (shift_one * one.scale - dense_sum) * norm_one.rate
     pull = (slope * tilt_one) @ slope.T, (flat_one + tilt_one * offset) @ slope.T
-    d_raw = d_raw.reshape(-1, channels)[: n * k] - (flat_raw @ pull[0] + pull[1]) * weight
+    pulled = jnp.matmul(flat_raw, pull[0], precision=_HIGHEST) + pull[1]
+    d_raw = d_raw.reshape(-1, channels)[: n * k] - pulled * weight
     gradients = (
         Layer(kernel_one, bias_one, scale_one, shift_one),
         Layer(kernel_two, bias_two, scale_two, shift_two),
