@@ -69,22 +69,35 @@ def refine(
 ) -> Refinement:
     """Refines `initial`, which maps source onto target, within the unit sphere.
 
+    Where `descend` ends is kept only if it scores no worse than `initial` (`score` at the last
+    cut).
+    """
+    transform, steps, settled = descend(source, target, initial, stages)
+    before, after = (score(source, target, t, stages[-1].cut) for t in (initial, transform))
+    improved = after <= before
+    return Refinement(jnp.where(improved, transform, initial), improved, settled, steps)
+
+
+def descend(
+    source: Surface,
+    target: Surface,
+    initial: Float[Array, "4 4"],
+    stages: tuple[Stage, ...] = STAGES,
+) -> tuple[Float[Array, "4 4"], Int[Array, ""], Bool[Array, ""]]:
+    """Where generalized ICP ends, in how many steps, and whether the last stage came to rest.
+
     In each stage: pair every source point with its closest target point, weigh the pairs
     down to zero at the cut (Tukey's biweight), take a Gauss-Newton step on SE(3), until nothing
-    moves. The result is kept only if it scores no worse than `initial` (`score` at the last cut).
+    moves.
     """
 
     def run(transform, stage):
-        transform, steps, settled = _descend(source, target, transform, stage)
+        transform, steps, settled = _run_stage(source, target, transform, stage)
         return transform, (steps, settled)
 
     # a scan, so that the stages share one compiled loop
     transform, (steps, settled) = lax.scan(run, initial, Stage(*jnp.array(stages, initial.dtype).T))
-    before, after = (score(source, target, t, stages[-1].cut) for t in (initial, transform))
-    improved = after <= before
-    return Refinement(
-        jnp.where(improved, transform, initial), improved, settled[-1], jnp.sum(steps)
-    )
+    return transform, jnp.sum(steps), settled[-1]
 
 
 def score(
@@ -97,7 +110,7 @@ def score(
     return jnp.sum(truncated * valid) / jnp.maximum(jnp.sum(valid), 1)
 
 
-def _descend(source, target, transform, stage):
+def _run_stage(source, target, transform, stage):
     def unsettled(state):
         _, step, size = state
         return (step < _STEPS_PER_CUT) & (size > _SETTLED)

@@ -70,7 +70,7 @@ def test_it_never_scores_worse_than_its_start(seed):
 def test_what_would_score_worse_is_not_taken(monkeypatch):
     source, target = (surface(solids.lopsided(400, seed)) for seed in (0, 1))
     away = start(0, (1.0, 0, 0))
-    monkeypatch.setattr(refinement, "_descend", lambda *_: (away, jnp.int32(1), True))
+    monkeypatch.setattr(refinement, "descend", lambda *_: (away, jnp.int32(1), jnp.array(True)))
 
     # a program of its own: nothing compiled before knows of the other descent
     found = jax.jit(lambda initial: refinement.refine(source, target, initial))(start(1))
