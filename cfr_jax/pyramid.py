@@ -198,7 +198,7 @@ def _equations(
 def _score(level, transform, cut):
     """`refinement.score` by the tree."""
     distance, _ = _pairs(level, transform, cut)
-    return float(np.mean(np.minimum(distance / cut, 1) ** 2))
+    return float(np.mean(1 - (1 - np.minimum(distance / cut, 1) ** 2) ** 3))
 
 
 def _fit(level, transform):

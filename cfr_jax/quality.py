@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cfr_jax import rigid
 from cfr_jax.neighbors import closest
-from cfr_jax.refinement import Surface, score
+from cfr_jax.refinement import Surface
 
 _HIGHEST = lax.Precision.HIGHEST
 _NUDGE = 0.15  # radians and units of the unit sphere; three times the usual inlier distance
@@ -83,7 +83,7 @@ def measure(
     def resistance(direction):
         def nudged(step):
             motion = rigid.exp(step * direction)
-            return score(source, target, rigid.compose(motion, transform), distance)
+            return _truncated(source, target, rigid.compose(motion, transform), distance)
 
         steps = jnp.array([-_TEXTURE, _TEXTURE, -_NUDGE, _NUDGE], moved.dtype)
         near_back, near_ahead, back, ahead = lax.map(nudged, steps)
@@ -149,6 +149,14 @@ def mutual_fit(
 
     there = covered(source, target, transform)
     return (there + covered(target, source, rigid.invert(transform))) / 2
+
+
+def _truncated(source, target, transform, distance):
+    """Mean over the source of the squared distance to the target, truncated; in [0, 1]."""
+    found = closest(rigid.apply(transform, source.points), target.points, target.mask)
+    truncated = jnp.minimum(found.square / distance**2, 1)
+    valid = source.mask.astype(truncated.dtype)
+    return jnp.sum(truncated * valid) / jnp.maximum(jnp.sum(valid), 1)
 
 
 def _pointwise_information(points, weights):

@@ -103,11 +103,14 @@ def descend(
 def score(
     source: Surface, target: Surface, transform: Float[Array, "4 4"], cut: float
 ) -> Float[Array, ""]:
-    """Mean over the source of the squared distance to the target, truncated at cut^2; in [0, 1]."""
+    """Mean over the source of Tukey's biweight loss of the distance to the target; in [0, 1].
+
+    It is 1 - (1 - d^2 / cut^2)^3, and 1 beyond the cut: what the weights of a descent belong to.
+    """
     found = closest(rigid.apply(transform, source.points), target.points, target.mask)
-    truncated = jnp.minimum(found.square / cut**2, 1)
-    valid = source.mask.astype(truncated.dtype)
-    return jnp.sum(truncated * valid) / jnp.maximum(jnp.sum(valid), 1)
+    loss = 1 - jnp.maximum(1 - found.square / cut**2, 0) ** 3
+    valid = source.mask.astype(loss.dtype)
+    return jnp.sum(loss * valid) / jnp.maximum(jnp.sum(valid), 1)
 
 
 def _run_stage(source, target, transform, stage):

@@ -252,7 +252,7 @@ def test_pairs_of_a_corpus_are_those_of_its_fixed_protocol(tmp_path, kind):
 @pytest.mark.parametrize(
     ("change", "limit", "message"),
     [
-        ({"kind": "movies"}, 1, "data.kind is 'movies', wanted one of corpus, modelnet40"),
+        ({"kind": "movies"}, 1, "data.kind is 'movies', wanted auto or one of corpus, modelnet40"),
         ({"protocol": "hard"}, 1, "data.protocol is 'hard', wanted one of clean, noise, partial"),
         ({"path": "nowhere.h5"}, 1, "no corpus at nowhere.h5"),
         ({"kind": "modelnet40", "path": "nowhere", "split": "test"}, 1, "Get modelnet40_ply"),
@@ -389,7 +389,9 @@ def test_clouds_of_any_size_go_through_align(monkeypatch):
     # then the refinement is one more iteration, and compilation takes no time of the pair
     assert answer.transforms.shape == (6, 4, 4)
     assert answer.seconds == 1.0
-    assert asked == {"params": {}, "refine": True, "max_points": 9, "seed": 3, "normals": None}
+    assert asked == {
+        "params": {}, "refine": True, "initial": None, "max_points": 9, "seed": 3, "normals": None,
+    }  # fmt: skip
 
 
 def test_a_network_goes_through_register_or_align_and_nothing_else(unchecked):
