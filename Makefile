@@ -19,8 +19,9 @@ RUNNABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_inf
 demo: .venv/.viz
 	$(BIN)/cfr demo
 
+# A file of tests stays in one process: its tests share what they compile.
 test: .venv/.dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-slow: .venv/.dev
 	$(BIN)/python -m pytest -m slow
