@@ -2,8 +2,8 @@
 
     python -m benchmarks.refinement --corpus ../shared/data/open_cad/val.h5 --pairs 60
 
-Pairs of the partial protocol with exact normals. The same descent starts at the network's answer
-and at the truth (which it leaves: `descend` has no say in whether its end is kept); told are the
+Pairs of the partial protocol with exact normals. `refine` starts at the network's answer, and its
+descent at the truth, which it leaves (`refine` would keep a start that scores better); told are the
 errors of both, over the pairs whose start lies in its basin: within 15 degrees and 0.3 radii.
 """
 
@@ -28,9 +28,12 @@ _BASIN = 15.0, 0.3
 
 
 @jax.jit
-def _descend(source, target, start):
-    surfaces = (solving.surface(prepare(**cloud, settings=SETTINGS)) for cloud in (source, target))
-    return refinement.descend(*surfaces, start)[0]
+def _ends(source, target, network, truth):
+    surfaces = [solving.surface(prepare(**cloud, settings=SETTINGS)) for cloud in (source, target)]
+    return {
+        "network": refinement.refine(*surfaces, network).transform,
+        "truth": refinement.descend(*surfaces, truth)[0],
+    }
 
 
 def main() -> None:
@@ -53,9 +56,9 @@ def main() -> None:
         start = align(*clouds, refine=False).transform
         plan = planned(*clouds)
         sides = solving.on_device(plan.source), solving.on_device(plan.target)
-        for name, motion in (("network", start), ("truth", truth)):
-            unit = jnp.asarray(plan.frames.to_unit(motion), jnp.float32)
-            ends[name].append(plan.frames.to_caller(np.asarray(_descend(*sides, unit))))
+        unit = [jnp.asarray(plan.frames.to_unit(m), jnp.float32) for m in (start, truth)]
+        for name, motion in _ends(*sides, *unit).items():
+            ends[name].append(plan.frames.to_caller(np.asarray(motion)))
         truths.append(truth)
         starts.append(start)
     truths, starts = np.stack(truths), np.stack(starts)
@@ -66,8 +69,8 @@ def main() -> None:
             metrics.err_r(np.stack(motions), truths),
             metrics.err_t(np.stack(motions), truths),
         )
-        figures = (np.mean(turn[inside]), np.median(turn[inside]), np.mean(slide[inside]))
-        print("from the {}: mean {:.3f}°, median {:.3f}°, {:.4f} radii".format(name, *figures))
+        of = [f(errors[inside]) for f in (np.mean, np.median) for errors in (turn, slide)]
+        print("from the {}: mean {:.3f}°, {:.4f}; median {:.3f}°, {:.4f}".format(name, *of))
 
 
 if __name__ == "__main__":

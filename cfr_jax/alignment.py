@@ -181,7 +181,7 @@ def answer(
     weakest = np.asarray(found.quality.weakest)[resistance.argmin()]
     fitness = float(found.quality.fitness)
     clues = {name: float(value) for name, value in confidence.named(found.clues).items()}
-    probability = confidence.of_alignment(clues)
+    probability = doubts.bounded(confidence.of_alignment(clues), fitness)
     neighbors = min(plan.source.neighbors.shape[1], plan.target.neighbors.shape[1])
     return Alignment(
         transform=transform,
@@ -206,6 +206,7 @@ def answer(
             fitness,
             neighbors,
             frames.size_ratio,
+            searched is not None,
         ),
         seconds=seconds,
         initial=initial,

@@ -26,9 +26,11 @@ def warnings_of(
     fitness: float,
     neighbors: int,
     size_ratio: float,
+    searched: bool,
 ) -> tuple[str, ...]:
     """`free` is the twist that nothing determines, if there is one; `rivals` are the turns by which
-    other answers differ (`turns`); `size_ratio` is the radius of the source over the target's."""
+    other answers differ (`turns`); `size_ratio` is the radius of the source over the target's;
+    `searched` tells whether more than one start was tried."""
     warnings = []
     if not 1 / _SIZES_APART < size_ratio < _SIZES_APART:
         larger, smaller, times = "source", "target", size_ratio
@@ -42,15 +44,22 @@ def warnings_of(
     if rivals:
         warnings.append(f"nearly symmetric: fits about as well {' or '.join(rivals)}")
     if probability < TRUSTED:
+        hint = "" if searched else '; clouds turned far need initial="global" (--global)'
         warnings.append(
             f"not to be trusted: confidence {probability:.2f}, "
-            f"{fitness:.0%} of the source lies on the target"
+            f"{fitness:.0%} of the source lies on the target{hint}"
         )
     if neighbors < SETTINGS.neighbors:
         warnings.append(
             f"small clouds: {neighbors} neighbors per point instead of {SETTINGS.neighbors}"
         )
     return tuple(warnings)
+
+
+def bounded(probability: float, fitness: float) -> float:
+    """A probability no greater than the fitness where the clouds hardly meet: those it was fitted
+    to did, and it says nothing of others."""
+    return min(probability, fitness) if fitness < _HARDLY else probability
 
 
 def turns(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import solids
 
+from cfr_jax import doubts
 from cfr_jax.alignment import align
 
 TRUTH = solids.motion(25)
@@ -86,3 +87,16 @@ def test_small_clouds_have_fewer_neighbors_and_it_says_so(count):
     assert found.neighbors == count - 1
     assert any(f"{count - 1} neighbors per point instead of 64" in w for w in found.warnings)
     assert not found.trusted or solids.degrees_between(found.transform, TRUTH) < 5
+
+
+def test_where_clouds_hardly_meet_the_fitness_bounds_the_confidence():
+    assert doubts.bounded(0.99, 0.1) == 0.1 and doubts.bounded(0.05, 0.1) == 0.05
+    assert doubts.bounded(0.99, 0.6) == 0.99
+
+
+def test_who_tried_one_start_is_told_of_the_search():
+    alone, searched = (
+        doubts.warnings_of(None, (), 0.2, 0.5, 64, 1.0, everywhere) for everywhere in (False, True)
+    )
+
+    assert "--global" in alone[0] and "--global" not in searched[0]

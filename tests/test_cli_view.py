@@ -164,3 +164,12 @@ def test_a_recording_without_rerun_is_refused_with_the_way_out(
     out = str(tmp_path / "scene.rrd")
     assert main(["view", str(tmp_path / "result.json"), "--out", out]) == 2
     assert 'pip install "cfr_jax[rerun]"' in capsys.readouterr().err
+
+
+def test_a_page_that_is_there_already_stays(tmp_path, capsys):
+    kept = tmp_path / "result.html"
+    kept.write_text("what cfr register --view wrote")
+
+    assert main(["view", str(tmp_path / "result.json")]) == 2
+    assert "--out" in capsys.readouterr().err
+    assert kept.read_text() == "what cfr register --view wrote"

@@ -185,4 +185,4 @@ def test_a_cloud_of_a_billion_units_is_no_mistake(place):
 def test_units_that_differ_are_remarked_on(place):
     from cfr_jax.doubts import warnings_of
 
-    assert any("same units?" in text for text in warnings_of(None, (), 0.9, 0.9, 64, 1000.0))
+    assert any("same units?" in text for text in warnings_of(None, (), 0.9, 0.9, 64, 1000.0, False))

@@ -49,8 +49,9 @@ def align_many(
 ) -> Iterator[Outcome]:
     """Aligns many pairs; yields one `Outcome` a pair, of which the generator is asked for.
 
-    A pair is `(source, target)` or `(source, target, initial)` as `align` takes them, or a function
-    without arguments that returns one, to be called when it is its turn. Pairs are drawn, read and
+    A pair is `(source, target)` or `(source, target, initial)`, clouds as `align` takes them and
+    one (4, 4) start (a search of all rotations is for `align` alone), or a function without
+    arguments that returns one, to be called when it is its turn. Pairs are drawn, read and
     made ready ahead of their turn by `workers` threads (default: the cores there are, up to 4);
     those of one padded size are solved `batch` at a time (default: 1 on a CPU, 16 on an
     accelerator) by one `vmap`ped program. A target that many sources share, as the same file or

@@ -55,6 +55,9 @@ _SUFFIXES = (*outputs.PAGE_SUFFIXES, *outputs.PICTURE_SUFFIXES, *outputs.RECORDI
 def run(args: argparse.Namespace) -> int:
     """Reads the result and its clouds, and draws them."""
     wanted = args.out or [args.result.with_suffix(".html")]
+    if not args.out and wanted[0].exists():
+        # perhaps the page of `cfr register --view`, which holds more
+        raise ValueError(f"{wanted[0]} is there already: name what to write with --out")
     for path in wanted:
         outputs.check_output("--out", path, _SUFFIXES)
         outputs.check_library("--out", path)
