@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from cfr_jax.cli import outputs
+from cfr_jax.cli import numbers, outputs
 
 UNTRUSTED = 3
 
@@ -122,7 +122,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     how.add_argument(
         "--max-points",
         metavar="N",
-        type=_positive,
+        type=numbers.positive,
         help="most points of each cloud that the network sees; more are slower (default: chosen)",
     )
     how.add_argument(
@@ -133,7 +133,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     how.add_argument(
         "--seed",
         metavar="S",
-        type=_not_negative,
+        type=numbers.not_negative,
         default=0,
         help="of the random choice of points (default: 0); the same seed gives the same answer",
     )
@@ -218,21 +218,3 @@ def _write_json(path: Path | None, document: dict) -> None:
         sys.stdout.write(text)
     else:
         write_atomically(path, text.encode())
-
-
-def _positive(text: str) -> int:
-    return _integer(text, 1)
-
-
-def _not_negative(text: str) -> int:
-    return _integer(text, 0)
-
-
-def _integer(text: str, least: int) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = least - 1
-    if value < least:
-        raise argparse.ArgumentTypeError(f"got {text!r}, wanted an integer of at least {least}")
-    return value
