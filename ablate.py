@@ -5,7 +5,7 @@ What has to be trained is trained by `train.py` in runs/ablations, shortly, and 
 ablations; the rest is `evaluate.py`. Run the same command again and it goes on where it stopped.
 """
 
-import importlib.util
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -22,13 +22,11 @@ _LIMIT = flags.DEFINE_integer("limit", 300, "How many pairs to compare on; 0 for
 
 def main(_) -> None:
     """Runs `train.py` for each training that the ablation asks for, then `evaluate.py`."""
-    spec = importlib.util.spec_from_file_location("eval_ablations", _EVALUATION)
-    known = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(known)
+    known = runpy.run_path(str(_EVALUATION))
     name = _ABLATION.value
-    if name not in known.ABLATIONS:
-        raise SystemExit(f"ablate.py: error: no ablation {name!r}: {', '.join(known.ABLATIONS)}")
-    config = known.get_config(name)
+    if name not in known["ABLATIONS"]:
+        raise SystemExit(f"ablate.py: error: no ablation {name!r}: {', '.join(known['ABLATIONS'])}")
+    config = known["get_config"](name)
     for variant in config.trainings:
         chosen = variant if _STEPS.value is None else f"{variant},{_STEPS.value}"
         _run(

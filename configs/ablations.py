@@ -6,7 +6,7 @@ what a good model wants, on small clouds: enough to tell them apart, and no more
 them, and compares them at full size.
 """
 
-import importlib.util
+import runpy
 from pathlib import Path
 
 from ml_collections import ConfigDict
@@ -25,19 +25,12 @@ VARIANTS = {
 def get_config(chosen: str = "cfr") -> ConfigDict:
     """Everything that `train.py` reads."""
     variant, _, steps = chosen.partition(",")
-    config = _open_cad().get_config()
+    # a config is a file and no module: it is found beside this one
+    beside = Path(__file__).with_name("open_cad.py")
+    config = runpy.run_path(str(beside))["get_config"]()
     changes = VARIANTS[variant]
     config.shared = changes.get("shared", False)
     config.settings = ConfigDict(changes.get("settings", {}))
     config.phases = ({"steps": int(steps or STEPS), "points": 256, "neighbors": 24, "batch": 8},)
     config.validation_pairs = 93
     return config
-
-
-def _open_cad():
-    # a config is a file and no module: it is found beside this one
-    path = Path(__file__).with_name("open_cad.py")
-    spec = importlib.util.spec_from_file_location("open_cad", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

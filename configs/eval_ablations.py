@@ -4,7 +4,7 @@ As `eval_open_cad.py`, with the variants of one ablation as methods. Where a var
 of its own, they are those that `ablate.py` trains in `config.runs`, by `ablations.py`.
 """
 
-import importlib.util
+import runpy
 from pathlib import Path
 
 from ml_collections import ConfigDict
@@ -33,7 +33,9 @@ ABLATIONS = {
 
 def get_config(ablation: str = "weights") -> ConfigDict:
     """Everything that `evaluate.py` reads, and `trainings`, which `ablate.py` reads."""
-    config = _open_cad().get_config()
+    # a config is a file and no module: it is found beside this one
+    beside = Path(__file__).with_name("eval_open_cad.py")
+    config = runpy.run_path(str(beside))["get_config"]()
     config.title = f"Ablation: {ablation}"
     config.runs = "runs/ablations"  # where the weights of the trainings are
     chosen = ABLATIONS[ablation]
@@ -47,12 +49,3 @@ def get_config(ablation: str = "weights") -> ConfigDict:
             entry["weights"] = f"{config.runs}/{run}/weights.safetensors"
         config.methods[name] = entry
     return config
-
-
-def _open_cad():
-    # a config is a file and no module: it is found beside this one
-    path = Path(__file__).with_name("eval_open_cad.py")
-    spec = importlib.util.spec_from_file_location("eval_open_cad", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

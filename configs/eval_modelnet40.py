@@ -1,6 +1,6 @@
 """Evaluation on ModelNet40 as published: partial, noisy pairs of the 20 unseen categories."""
 
-import importlib.util
+import runpy
 from pathlib import Path
 
 from ml_collections import ConfigDict
@@ -8,7 +8,9 @@ from ml_collections import ConfigDict
 
 def get_config() -> ConfigDict:
     """As `eval_open_cad.py` with all its settings, on the benchmark's 1,266 test shapes."""
-    config = _open_cad().get_config()
+    # a config is a file and no module: it is found beside this one
+    beside = Path(__file__).with_name("eval_open_cad.py")
+    config = runpy.run_path(str(beside))["get_config"]()
     config.title = "ModelNet40, partial pairs of unseen categories"
     config.data = ConfigDict()
     config.data.kind = "modelnet40"
@@ -17,12 +19,3 @@ def get_config() -> ConfigDict:
     config.data.protocol = "partial"
     config.limit = 0
     return config
-
-
-def _open_cad():
-    # a config is a file and no module: it is found beside this one
-    path = Path(__file__).with_name("eval_open_cad.py")
-    spec = importlib.util.spec_from_file_location("eval_open_cad", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

@@ -3,7 +3,7 @@
 See docs/train-on-your-data.md.
 """
 
-import importlib.util
+import runpy
 from pathlib import Path
 
 from ml_collections import ConfigDict
@@ -14,7 +14,9 @@ def get_config() -> ConfigDict:
 
     A source is left out where its `repeat` is 0.
     """
-    config = _scans().get_config()
+    # a config is a file and no module: it is found beside this one
+    beside = Path(__file__).with_name("scans.py")
+    config = runpy.run_path(str(beside))["get_config"]()
     config.data = ConfigDict()
     config.data.train = {
         # views of one scan, turned and cropped: needs no known motion
@@ -31,12 +33,3 @@ def get_config() -> ConfigDict:
     config.sampling.noise = (0.0, 0.01)
     config.sampling.outliers = (0.0, 0.03)
     return config
-
-
-def _scans():
-    # a config is a file and no module: it is found beside this one
-    path = Path(__file__).with_name("scans.py")
-    spec = importlib.util.spec_from_file_location("scans", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

@@ -4,7 +4,7 @@ Validated on frames of its own, which no training pair shares; `train.py` refuse
 last frames of both (`data.test_frames`) are left for `evaluate.py`.
 """
 
-import importlib.util
+import runpy
 from pathlib import Path
 
 from ml_collections import ConfigDict
@@ -12,7 +12,9 @@ from ml_collections import ConfigDict
 
 def get_config() -> ConfigDict:
     """As `open_cad.py`, from the shipped weights on, at a lower rate, with gentler augmentation."""
-    config = _open_cad().get_config()
+    # a config is a file and no module: it is found beside this one
+    beside = Path(__file__).with_name("open_cad.py")
+    config = runpy.run_path(str(beside))["get_config"]()
     lidar = {"kind": "kitti", "path": "../shared/data/scans/lidar", "sequences": ("00",)}
     lidar |= {"distances": (2.0, 5.0, 10.0), "stride": 1}  # m between the frames; frames
     rgbd = {"kind": "pairs", "path": "../shared/data/scans/rgbd/pairs.h5"}
@@ -44,12 +46,3 @@ def get_config() -> ConfigDict:
     config.validation_pairs = 100
     config.validate_every = 250
     return config
-
-
-def _open_cad():
-    # a config is a file and no module: it is found beside this one
-    path = Path(__file__).with_name("open_cad.py")
-    spec = importlib.util.spec_from_file_location("open_cad", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
