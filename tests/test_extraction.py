@@ -44,10 +44,18 @@ def tiled(layers, raw, mask=None):
     return extraction.pooled_features(layers, raw, groups=GROUPS, mask=mask)
 
 
-@pytest.fixture(params=[4096, 3 * K], ids=["one tile", "four tiles, the last not full"])
+TILES = {
+    "one tile": (4096, 1 << 20),
+    "four tiles, the last not full": (3 * K, 1 << 20),
+    "four tiles, two of them kept": (3 * K, 2 * 3 * K * WIDTH),
+}
+
+
+@pytest.fixture(params=TILES.values(), ids=TILES.keys())
 def tiles(request, monkeypatch):
-    monkeypatch.setattr(extraction, "_FORWARD_ROWS", request.param)
-    monkeypatch.setattr(extraction, "_BACKWARD_ROWS", request.param)
+    rows, kept = request.param
+    monkeypatch.setattr(extraction.tiles, "ROWS", rows)
+    monkeypatch.setattr(extraction.tiles, "KEPT", kept)
 
 
 MASK = jnp.arange(N) % 3 != 1
