@@ -25,6 +25,8 @@ def main(_) -> None:
     # orbax writes pages about a full disk; what went wrong is said below, once
     logging.set_verbosity(logging.FATAL)
     try:
+        if not _COORDINATOR.value:
+            devices.one_per_core(*(phase["batch"] for phase in _CONFIG.value.phases))
         devices.join(_COORDINATOR.value, _PROCESSES.value, _PROCESS.value)
         best = loop.run(_CONFIG.value, Path(_WORKDIR.value))
     except (ValueError, OSError) as error:

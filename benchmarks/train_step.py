@@ -3,8 +3,9 @@
 The naive step is what one writes first: neighbors by `top_k` on the device, the per-neighbor MLP
 as plain matrix products and norms, `vmap` over the batch, `jax.grad` of the mean loss. Both have
 the same loss, network and optimizer, and must give the same loss. Ours gets its neighbors from the
-host, whose time is counted here though in training it runs ahead. Run it on a machine that does
-nothing else.
+host, whose time is counted here though in training it runs ahead, and on a CPU a device of each
+core, as `train.py` does; the naive one has all cores for its one device. Run it on a machine that
+does nothing else.
 """
 
 from __future__ import annotations
@@ -41,11 +42,13 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
 
+    devices.one_per_core(args.batch)
     schedule = optimizers.make_schedule("cosine", peak_rate=1e-3, steps=1000, warmup=0.1)
     optimizer = optimizers.make_optimizer("adamw", schedule, clip=1.0, weight_decay=1e-5)
     sampling = Sampling(points=args.points, neighbors=args.neighbors)
     batch = batch_at(ShapeSource(ellipsoids()), 0, args.batch, sampling, seed=0)
-    print(f"{jax.devices()[0].device_kind}, {len(os.sched_getaffinity(0))} CPU cores, jax "
+    print(f"{jax.devices()[0].device_kind}, {len(os.sched_getaffinity(0))} CPU cores, "
+          f"{len(jax.devices())} devices, jax "
           f"{jax.__version__}; {args.points} points, {args.neighbors} neighbors, batch "
           f"{args.batch}, {args.repeats} repeats, milliseconds\n")  # fmt: skip
     cpu = jax.default_backend() == "cpu"
@@ -68,12 +71,13 @@ def main() -> None:
         state, measured = step.train_step(state, placed, recipe=recipe)
         return state, measured.total.mean()
 
+    one = jax.make_mesh((1,), (devices.AXIS,), devices=jax.devices()[:1])
     naive = functools.partial(
         naive_step, batch=batch, optimizer=optimizer, neighbors=args.neighbors
     )
     with mock.patch.multiple(network, pooled_features=plain_features, pooled_layer=plain_layer):
-        slow, loss_naive = measure("naive", naive, optimizer, args.repeats)
-    fast, loss = measure("ours", ours, optimizer, args.repeats)
+        slow, loss_naive = measure("naive", naive, start(optimizer, one), args.repeats)
+    fast, loss = measure("ours", ours, start(optimizer, recipe.mesh), args.repeats)
     print(f"\nlosses of the first step: {loss_naive:.6f} and {loss:.6f}")
     print(f"ours is {slow / fast:.2f} times faster (medians)")
 
@@ -143,10 +147,15 @@ def plain_layer(layer, x, *, groups, mask=None):
     return jax.nn.relu(apply_layer(layer, x, groups=groups)).max(axis=0)
 
 
-def measure(what: str, advance: Callable, optimizer, repeats: int) -> tuple[float, float]:
+def start(optimizer, mesh) -> step.TrainState:
+    """A state at step zero, on these devices."""
+    return devices.replicate(
+        step.init_state(network.init_params(jax.random.key(0)), optimizer), mesh
+    )
+
+
+def measure(what: str, advance: Callable, state, repeats: int) -> tuple[float, float]:
     """Median milliseconds of a step, the compiling one left out, and the first step's loss."""
-    state = step.init_state(network.init_params(jax.random.key(0)), optimizer)
-    state = devices.replicate(state, devices.make_mesh())
     times, used, losses = [], [], []
     for _ in range(repeats + 1):
         began, worked = time.perf_counter(), time.process_time()

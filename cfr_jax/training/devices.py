@@ -6,6 +6,8 @@ Data parallel: every device holds the whole state and a share of each batch. Wit
 
 from __future__ import annotations
 
+import math
+import os
 from typing import Any
 
 import jax
@@ -33,6 +35,23 @@ def join(coordinator: str, processes: int, process: int) -> None:
     if not 0 <= process < processes:
         raise ValueError(f"process: got {process}, wanted 0 to {processes - 1}")
     jax.distributed.initialize(coordinator, num_processes=processes, process_id=process)
+
+
+def one_per_core(*batches: int) -> None:
+    """On a CPU, makes devices of the cores: as many as all `batches` can be spread over.
+
+    A pair then has a core of its own, where otherwise every operation ends with one core waiting
+    for the other. Call it before anything else of JAX; a number of devices that was asked for
+    stands (JAX_NUM_CPU_DEVICES, or --xla_force_host_platform_device_count in XLA_FLAGS).
+    """
+    asked = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if asked or jax.config.jax_num_cpu_devices >= 0:
+        return
+    affinity = getattr(os, "sched_getaffinity", None)  # Linux: the cores this process may use
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    common = math.gcd(*batches)
+    count = max(number for number in range(1, cores + 1) if common % number == 0)
+    jax.config.update("jax_num_cpu_devices", count)
 
 
 def make_mesh() -> Mesh:
