@@ -20,13 +20,17 @@ _PROCESS = flags.DEFINE_integer("process", 0, "Which of them this is, from 0.")
 
 def main(_) -> None:
     """Everything of interest is in `cfr_jax.training.loop`."""
+    import jax
+
     from cfr_jax.training import devices, loop
 
     # orbax writes pages about a full disk; what went wrong is said below, once
     logging.set_verbosity(logging.FATAL)
     try:
         if not _COORDINATOR.value:
-            devices.one_per_core(*(phase["batch"] for phase in _CONFIG.value.phases))
+            cores = devices.of_cores(*(phase["batch"] for phase in _CONFIG.value.phases))
+            if cores is not None:
+                jax.config.update("jax_num_cpu_devices", cores)
         devices.join(_COORDINATOR.value, _PROCESSES.value, _PROCESS.value)
         best = loop.run(_CONFIG.value, Path(_WORKDIR.value))
     except (ValueError, OSError) as error:

@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
 
-    devices.one_per_core(args.batch)
+    jax.config.update("jax_num_cpu_devices", devices.of_cores(args.batch) or -1)
     schedule = optimizers.make_schedule("cosine", peak_rate=1e-3, steps=1000, warmup=0.1)
     optimizer = optimizers.make_optimizer("adamw", schedule, clip=1.0, weight_decay=1e-5)
     sampling = Sampling(points=args.points, neighbors=args.neighbors)

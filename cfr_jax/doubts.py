@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from cfr_jax.planning import SETTINGS
 
@@ -66,6 +65,11 @@ def turns(
     transform: Float[np.ndarray, "4 4"], others: Float[np.ndarray, "a 4 4"]
 ) -> tuple[str, ...]:
     """By which turns `others` differ from `transform`, about axes of the target's frame."""
+    if not len(others):
+        return ()
+    # imported here: half a second that most answers need not wait for
+    from scipy.spatial.transform import Rotation
+
     told = []
     for other in others:
         turn = Rotation.from_matrix(other[:3, :3] @ transform[:3, :3].T).as_rotvec(degrees=True)

@@ -18,6 +18,7 @@ _SWEEPS = 5
 _HIGHEST = lax.Precision.HIGHEST
 
 
+@jax.jit  # so that its many scalars are traced once
 def symmetric_eigen(
     matrix: Float[Array, "d d"],
 ) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:

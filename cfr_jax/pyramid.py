@@ -9,13 +9,12 @@ over some thousand pairs at a time, so memory grows with the clouds and nothing 
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial import cKDTree
 
 from cfr_jax import refinement, rigid
 from cfr_jax.io import PointCloud
@@ -25,6 +24,9 @@ from cfr_jax.planning import Plan
 from cfr_jax.preparation import bucket, subsample
 from cfr_jax.refinement import Stage, Surface
 from cfr_jax.solving import DISTANCE, Found
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 _FULLER = 8  # points of the middle level, as a multiple of the network's
 _NEIGHBORS = 24  # a normal's neighborhood; shrinks with the spacing
@@ -119,6 +121,9 @@ def _unit(cloud, center, scale, motion):
 
 
 def _level(source, target, budget):
+    # imported here: a fifth of a second that `align` alone need not wait for
+    from scipy.spatial import cKDTree
+
     parts = []
     for cloud in (source, target):
         rows = subsample(cloud.points, budget, seed=0)

@@ -49,6 +49,7 @@ def invert(transform: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
     return from_parts(back, -jnp.matmul(back, transform[:3, 3], precision=_HIGHEST))
 
 
+@jax.jit  # so that it is traced once and not in every iteration
 def fit_rigid(
     source: Float[Array, "n 3"], target: Float[Array, "n 3"], weights: Float[Array, " n"]
 ) -> Float[Array, "4 4"]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import brentq
-from scipy.spatial.transform import Rotation
 
 
 def cover(count: int) -> Float[np.ndarray, "count 3 3"]:
@@ -17,6 +15,10 @@ def cover(count: int) -> Float[np.ndarray, "count 3 3"]:
     61 degrees for 64, 46 for 128, 37 for 256 (`tests/test_rotations.py` measures it). Raises
     ValueError for a count below 1.
     """
+    # imported here: half a second that only a search of all rotations has to wait for
+    from scipy.optimize import brentq
+    from scipy.spatial.transform import Rotation
+
     if count < 1:
         raise ValueError(f"count: got {count} rotations, wanted at least 1")
     psi = brentq(lambda x: x**4 - x - 4, 1, 2)

@@ -103,11 +103,8 @@ def surface(cloud: Cloud) -> Surface:
 def on_device(unit: UnitCloud) -> dict[str, jax.Array]:
     """The arguments of `registration.prepare` for a unit cloud."""
     points = unit.points if unit.normals is None else np.hstack([unit.points, unit.normals])
-    return {
-        "points": jnp.asarray(points),
-        "neighbors": jnp.asarray(unit.neighbors),
-        "mask": jnp.asarray(unit.mask),
-    }
+    # not jnp.asarray, which compiles a copy of each shape
+    return jax.device_put({"points": points, "neighbors": unit.neighbors, "mask": unit.mask})
 
 
 @functools.partial(jax.jit, static_argnames=("refine",))

@@ -125,24 +125,17 @@ def test_a_batch_that_the_devices_cannot_share_is_refused():
     ("cores", "batches", "wanted"), [(2, [8, 8], 2), (16, [8], 8), (6, [8, 12], 4), (4, [7], 1)]
 )
 def test_cores_become_devices_that_share_every_batch(monkeypatch, cores, batches, wanted):
-    told = {}
     monkeypatch.delenv("XLA_FLAGS", raising=False)
+    monkeypatch.delenv("JAX_NUM_CPU_DEVICES", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
-    monkeypatch.setattr(jax.config, "update", told.__setitem__)
 
-    devices.one_per_core(*batches)
-
-    assert told == {"jax_num_cpu_devices": wanted}
+    assert devices.of_cores(*batches) == wanted
 
 
 def test_a_number_of_devices_that_was_asked_for_stands(monkeypatch):
-    told = {}
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=3")
-    monkeypatch.setattr(jax.config, "update", told.__setitem__)
 
-    devices.one_per_core(8)
-
-    assert not told
+    assert devices.of_cores(8) is None
 
 
 def test_several_processes_need_a_place_to_meet():

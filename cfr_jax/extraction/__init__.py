@@ -34,6 +34,7 @@ from cfr_jax.layers import Layer
 __all__ = ["pooled_features"]
 
 
+@functools.partial(jax.jit, static_argnames=("groups",))
 def pooled_features(
     layers: tuple[Layer, Layer, Layer],
     raw: Float[Array, "n k c"],

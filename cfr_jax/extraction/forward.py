@@ -34,22 +34,28 @@ def forward(
 ) -> tuple[Float[Array, "n d"], Kept]:
     """The pooled features, and what is kept for the gradient; all zero where no point is valid."""
 
-    def of_points(layers, raw, valid):
-        return _forward(layers, raw, valid, groups)
+    n, k, _ = raw.shape
+    widths = [layer.bias.size for layer in layers]
+    tiles = cut_rows(raw, count_of(n, k))
 
-    def of_none(*arguments):
-        return jax.tree.map(jnp.zeros_like, jax.eval_shape(of_points, *arguments))
+    def of_points():
+        return _forward(layers, raw, tiles, valid, groups)
+
+    def of_none():
+        norms = tuple(Norm(*2 * (jnp.zeros(width, raw.dtype),)) for width in widths)
+        pooled = jnp.zeros((n, widths[-1]), raw.dtype)
+        kept = jnp.zeros((kept_of(tiles, widths[1]), tiles.shape[1], widths[1]), raw.dtype)
+        return pooled, Kept(norms, pooled, kept)
 
     # To XLA's scheduler a branch is one operation: so the clouds of a pair come one after the other
     # and take the same scratch. (The barrier hides from it that without a mask all are valid.)
     some = jnp.any(lax.optimization_barrier(valid) > 0)
-    return lax.cond(some, of_points, of_none, layers, raw, valid)
+    return lax.cond(some, of_points, of_none)
 
 
-def _forward(layers, raw, valid, groups):
+def _forward(layers, raw, tiles, valid, groups):
     one, two, three = layers
     n, k, _ = raw.shape
-    tiles = cut_rows(raw, count_of(n, k))
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
 
     norm_one = norm_of(*_moments_of_first(one, tiles, valid, rows), groups)

@@ -37,21 +37,21 @@ def join(coordinator: str, processes: int, process: int) -> None:
     jax.distributed.initialize(coordinator, num_processes=processes, process_id=process)
 
 
-def one_per_core(*batches: int) -> None:
-    """On a CPU, makes devices of the cores: as many as all `batches` can be spread over.
+def of_cores(*batches: int) -> int | None:
+    """How many devices to make of a CPU's cores (JAX's option `jax_num_cpu_devices`): as many as
+    all `batches` can be spread over.
 
     A pair then has a core of its own, where otherwise every operation ends with one core waiting
-    for the other. Call it before anything else of JAX; a number of devices that was asked for
-    stands (JAX_NUM_CPU_DEVICES, or --xla_force_host_platform_device_count in XLA_FLAGS).
+    for the other. None where the environment asks for a number, by JAX_NUM_CPU_DEVICES or by
+    --xla_force_host_platform_device_count in XLA_FLAGS.
     """
-    asked = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if asked or jax.config.jax_num_cpu_devices >= 0:
-        return
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "JAX_NUM_CPU_DEVICES" in os.environ or "xla_force_host_platform_device_count" in flags:
+        return None
     affinity = getattr(os, "sched_getaffinity", None)  # Linux: the cores this process may use
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
     common = math.gcd(*batches)
-    count = max(number for number in range(1, cores + 1) if common % number == 0)
-    jax.config.update("jax_num_cpu_devices", count)
+    return max(number for number in range(1, cores + 1) if common % number == 0)
 
 
 def make_mesh() -> Mesh:
