@@ -83,12 +83,9 @@ def export_register(
 
 
 def save_exported(path: str | os.PathLike[str], exported: jax_export.Exported) -> None:
-    """Writes the program, beside and then renamed.
-
-    Raises ModuleNotFoundError without flatbuffers (the `export` extra).
-    """
+    """Writes the program, beside and then renamed."""
     path = Path(path)
-    content = _with_flatbuffers(exported.serialize)
+    content = exported.serialize()
     beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         beside.write_bytes(content)
@@ -150,26 +147,12 @@ class ExportedRegister:
 
 
 def load_exported(path: str | os.PathLike[str]) -> ExportedRegister:
-    """What `save_exported` (or `cfr export`) wrote.
-
-    Raises ValueError for other files, ModuleNotFoundError without flatbuffers.
-    """
+    """What `save_exported` (or `cfr export`) wrote. Raises ValueError for other files."""
     content = bytearray(Path(path).read_bytes())
     try:
-        exported = _with_flatbuffers(lambda: jax_export.deserialize(content))
-    except ModuleNotFoundError:
-        raise
+        exported = jax_export.deserialize(content)
     except Exception as error:  # flatbuffers reads past the end, or finds nonsense
         raise ValueError(f"{path}: is no exported program: {type(error).__name__}") from error
     if len(exported.in_avals) != 4:
         raise ValueError(f"{path}: is an exported program, and not one of `register`")
     return ExportedRegister(exported)
-
-
-def _with_flatbuffers(action):
-    try:
-        return action()
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            'exported programs need flatbuffers: pip install "cfr_jax[export]"', name=error.name
-        ) from error

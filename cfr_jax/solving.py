@@ -16,7 +16,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from cfr_jax import confidence, quality, refinement
+from cfr_jax import confidence, programs, quality, refinement
 from cfr_jax.planning import SETTINGS
 from cfr_jax.preparation import UnitCloud
 from cfr_jax.refinement import Surface
@@ -38,6 +38,9 @@ class Found:
     steps: Int[Array, "*batch"]
     quality: quality.Quality
     clues: confidence.Clues
+
+
+programs.storable(Found, Registration, quality.Quality, confidence.Clues, confidence.NetworkClues)
 
 
 def solve(params: dict, source: Cloud, target: Encoded, *, refine: bool) -> Found:
@@ -120,23 +123,9 @@ def timed(seconds: dict[str, float], function: Callable, *arguments: Any, **stat
     """What a jitted function answers, when it is there; adds what that took to the `seconds` of
     "compile" and of "run"."""
     began = time.perf_counter()
-    program = compiled(function, *arguments, **static)
+    program = programs.compiled(function, *arguments, **static)
     ready = time.perf_counter()
     answer = jax.block_until_ready(program(*arguments))
     seconds["compile"] += ready - began
     seconds["run"] += time.perf_counter() - ready
     return answer
-
-
-def compiled(function: Callable, *arguments: Any, **static: Any) -> Callable:
-    """The compiled program of a jitted function for arguments of these sizes, made once, so that
-    compiling can be timed apart from running."""
-    leaves, structure = jax.tree.flatten(arguments)
-    shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-    return _program(function, tuple(static.items()), structure, shapes)
-
-
-@functools.lru_cache(maxsize=64)
-def _program(function, static, structure, shapes):
-    arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    return function.lower(*arguments, **dict(static)).compile()

@@ -15,7 +15,7 @@ import pytest
 import solids
 
 import cfr_jax
-from cfr_jax import preparation, solving
+from cfr_jax import preparation, programs
 from cfr_jax.alignment import align
 
 DEMO = Path(cfr_jax.__file__).parent / "demo"
@@ -212,11 +212,11 @@ def test_the_seed_chooses_the_points():
 
 
 def test_a_size_in_the_same_bucket_is_not_compiled_again(pair, answer):
-    before = solving._program.cache_info()
+    before = programs._program.cache_info()
 
     found = align(pair[0][:430], pair[1][:470])
 
-    after = solving._program.cache_info()
+    after = programs._program.cache_info()
     assert (after.hits, after.misses) == (before.hits + 1, before.misses)
     assert found.seconds["compile"] < found.seconds["run"] < found.seconds["total"]
 
@@ -230,10 +230,10 @@ def test_a_stray_point_is_left_out_and_changes_little(pair):
 
 def test_64_bit_jax_changes_nothing(pair, answer):
     params = cfr_jax.load_params()
-    solving._program.cache_clear()
+    programs._program.cache_clear()
 
     with jax.enable_x64(True):
         found = align(*pair, params=params)
 
-    solving._program.cache_clear()
+    programs._program.cache_clear()
     np.testing.assert_allclose(found.transform, answer.transform, atol=1e-5)

@@ -109,11 +109,11 @@ def test_one_target_of_many_sources_is_read_prepared_and_encoded_once(tmp_path, 
     read = counted("read", stream.as_point_cloud)
     monkeypatch.setattr(stream, "as_point_cloud", read)
     monkeypatch.setattr(preparation, "to_unit", counted("unit", preparation.to_unit, is_target))
-    programs = device.solving.compiled
+    compiled = device.programs.compiled
     monkeypatch.setattr(
-        device.solving,
+        device.programs,
         "compiled",
-        counted("encoded", programs, lambda function, *_, **__: function is device.encode_target),
+        counted("encoded", compiled, lambda function, *_, **__: function is device.encode_target),
     )
 
     # when

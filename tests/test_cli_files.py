@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from cfr_jax import io
+from cfr_jax import io, programs
 from cfr_jax.cli import cache, outputs
 from cfr_jax.cli.transforms import read_transform
 
@@ -110,6 +110,7 @@ def jax_cache(monkeypatch):
     before = {name: jax.config.values[name] for name in names}
     jax.config.update("jax_compilation_cache_dir", None)
     monkeypatch.delenv("CFR_JAX_CACHE", raising=False)
+    monkeypatch.setattr(programs, "_places", [])
     yield lambda: jax.config.values["jax_compilation_cache_dir"]
     for name, value in before.items():
         jax.config.update(name, value)

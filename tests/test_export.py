@@ -17,8 +17,6 @@ from cfr_jax.network import init_params
 from cfr_jax.registration import Settings, register
 from cfr_jax.weights import save_params
 
-pytest.importorskip("flatbuffers", reason="exported programs need the export extra")
-
 SETTINGS = Settings(neighbors=8)
 CAPACITY = 64
 EXAMPLE = Path(__file__).parents[1] / "examples" / "run_exported.py"
@@ -121,15 +119,6 @@ def test_a_file_that_holds_no_program_is_refused_by_name(content, tmp_path):
     (tmp_path / "model.stablehlo").write_bytes(content)
     with pytest.raises(ValueError, match="model.stablehlo: is no exported program"):
         load_exported(tmp_path / "model.stablehlo")
-
-
-def test_without_flatbuffers_the_message_names_the_extra(tmp_path, capsys, monkeypatch):
-    real = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == "flatbuffers" else real(name)
-    )
-    assert main(["export", "--out", str(tmp_path / "model.stablehlo")]) == 2
-    assert 'pip install "cfr_jax[export]"' in capsys.readouterr().err
 
 
 def test_the_command_writes_a_program_and_says_what_it_takes(tiny, tmp_path, capsys):

@@ -24,7 +24,7 @@ LAYERS = (
     ("confidence",),
     ("registration",),
     ("rpmnet",),
-    ("losses", "metrics", "weights", "progress", "cards", "export"),
+    ("losses", "metrics", "weights", "progress", "cards", "export", "programs"),
     ("convert",),
     ("io",),
     ("data", "viewer"),

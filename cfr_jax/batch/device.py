@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfr_jax import solving
+from cfr_jax import programs, solving
 from cfr_jax.alignment import Alignment, answer
 from cfr_jax.batch.memo import Memo
 from cfr_jax.planning import SETTINGS, Plan
@@ -37,7 +37,7 @@ class Device:
         targets, waited = zip(*(self._encode(plan.target) for plan in filled), strict=True)
         arguments = (self._params, [solving.on_device(plan.source) for plan in filled], targets)
         started = time.perf_counter()
-        program = solving.compiled(solve_many, *arguments, refine=self._refine)
+        program = programs.compiled(solve_many, *arguments, refine=self._refine)
         compiled = time.perf_counter()
         found = jax.device_get(program(*arguments))
         done = time.perf_counter()
@@ -60,7 +60,7 @@ class Device:
             nonlocal compiling
             arguments = (self._params, solving.on_device(target))
             started = time.perf_counter()
-            program = solving.compiled(encode_target, *arguments)
+            program = programs.compiled(encode_target, *arguments)
             compiling = time.perf_counter() - started
             return program(*arguments)
 

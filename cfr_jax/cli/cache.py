@@ -30,6 +30,10 @@ def keep_compiled_programs() -> None:
     warnings.filterwarnings("ignore", message=".*persistent compilation cache")
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    # imported here: it takes JAX along
+    from cfr_jax import programs
+
+    programs.keep_in(folder)
 
 
 def _user_folder() -> Path:

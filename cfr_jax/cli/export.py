@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from pathlib import Path
 
 from cfr_jax.cli import outputs
@@ -67,9 +66,6 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Traces the program for each platform, and writes it."""
     outputs.check_output("--out", args.out, (".stablehlo",))
-    if importlib.util.find_spec("flatbuffers") is None:
-        raise ValueError('exported programs need flatbuffers: pip install "cfr_jax[export]"')
-
     from cfr_jax.export import export_register, save_exported
     from cfr_jax.weights import DEFAULT, read_weights
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfr_jax import refinement, registration, rpmnet, solving
+from cfr_jax import programs, refinement, registration, rpmnet, solving
 from cfr_jax.alignment import align
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.methods import Answer, Solver, clouds_of
@@ -182,7 +182,7 @@ def _run(
 ) -> tuple[Float[np.ndarray, "b i 4 4"], float]:
     """Motions of a batch in host memory, and the seconds of it that were compilation."""
     began = time.perf_counter()
-    compiled = solving.compiled(_solve, params, sources, targets, program=program)
+    compiled = programs.compiled(_solve, params, sources, targets, program=program)
     compiling = time.perf_counter() - began
     found = jax.device_get(compiled(params, sources, targets))
     return np.asarray(found, np.float64), compiling

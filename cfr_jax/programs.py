@@ -1,0 +1,115 @@
+"""Programs compiled for arguments of given sizes, and kept between processes as they were lowered.
+
+JAX's compilation cache is asked with a lowered program, and to trace and lower one takes longer
+than to load and run it. So where there is a folder for them (`keep_in`), lowered programs are kept
+as well, as `jax.export` writes them: StableHLO, nothing that could be run while it is read.
+Whatever could change a program is part of its name: the sources of this package, the versions and
+the options of JAX, the sizes of the arguments.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import flax
+import jax
+import jaxlib
+from jax import export as jax_export
+
+_SHA256 = 32  # bytes, in front of each file
+_places: list[Path] = []  # where programs are kept; empty: nowhere
+
+
+def keep_in(folder: Path) -> None:
+    """From now on, lowered programs are kept in `folder`, those of these versions alone. Where
+    nothing can be written, they are traced again, and nothing else happens."""
+    _places[:] = [folder / _versions()]
+
+
+def storable(*nodes: type) -> None:
+    """Says that answers made of these dataclasses of arrays can be kept."""
+    for node in nodes:
+        jax_export.register_pytree_node_serialization(
+            node,
+            serialized_name=f"{node.__module__}.{node.__qualname__}",
+            serialize_auxdata=lambda _: b"",
+            deserialize_auxdata=lambda _: (),
+        )
+
+
+def compiled(function: Callable, *arguments: Any, **static: Any) -> Callable:
+    """The compiled program of a jitted function for arguments of these sizes, made once, so that
+    compiling can be timed apart from running."""
+    leaves, structure = jax.tree.flatten(arguments)
+    shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+    return _program(function, tuple(static.items()), structure, shapes)
+
+
+@functools.lru_cache(maxsize=64)
+def _program(function, static, structure, shapes):
+    arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    if _places:
+        name = _digest(function.__module__, function.__qualname__, static, structure, shapes)
+        path = _places[0] / f"{function.__name__}-{name}.stablehlo"
+        exported = _read(path) or _export(path, function, arguments, dict(static))
+        if exported is not None:
+            return jax.jit(exported.call).lower(*arguments).compile()
+    return function.lower(*arguments, **dict(static)).compile()
+
+
+def _read(path):
+    """The program kept at `path`; None where there is none, or not the one that was written."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    told, content = content[:_SHA256], content[_SHA256:]
+    if told != hashlib.sha256(content).digest():
+        return None
+    return jax_export.deserialize(bytearray(content))
+
+
+def _export(path, function, arguments, static):
+    """The exported program, kept at `path` if possible; None for answers that cannot be kept."""
+    try:
+        exported = jax_export.export(function)(*arguments, **static)
+        content = exported.serialize()
+    except ValueError:
+        return None
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        for older in path.parent.parent.glob("programs-*"):
+            if older != path.parent:
+                shutil.rmtree(older, ignore_errors=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside.write_bytes(hashlib.sha256(content).digest() + content)
+        os.replace(beside, path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            beside.unlink(missing_ok=True)
+    return exported
+
+
+def _versions() -> str:
+    """Of everything that a lowered program depends on but the arguments."""
+    package = Path(__file__).parent
+    files = ((path.relative_to(package), path.stat()) for path in sorted(package.rglob("*.py")))
+    return "programs-" + _digest(
+        *((str(name), stat.st_size, stat.st_mtime_ns) for name, stat in files),
+        jax.__version__,
+        jaxlib.__version__,
+        flax.__version__,
+        jax.default_backend(),
+        *sorted(item for item in os.environ.items() if item[0].startswith(("JAX_", "XLA_"))),
+    )
+
+
+def _digest(*parts: object) -> str:
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
