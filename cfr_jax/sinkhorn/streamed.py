@@ -69,29 +69,30 @@ def _forward(affinity, points, masks, passes, most_rows):
     blocks = _Blocks(affinity, masks, most_rows)
     tiny = jnp.finfo(points.dtype).tiny
 
-    def one_pass(v, _):
+    def one_pass(v, shift=None):
         def rows(found, here):
-            block, _, shift = blocks.make(here)
+            block, _, shift = blocks.make(*here)
             sums = jnp.matmul(block, v, precision=_HIGHEST) + jnp.exp(-shift)
             u = 1 / jnp.maximum(sums, tiny)
             return found + jnp.matmul(u, block, precision=_HIGHEST), (u, shift)
 
-        found, (u, shift) = lax.scan(rows, jnp.zeros(m, v.dtype), blocks.rows)
-        v_next = 1 / (found + 1)
-        return v_next, (u, v, shift, found)
+        given = (blocks.rows,) if shift is None else (blocks.rows, shift)
+        found, (u, shift) = lax.scan(rows, jnp.zeros(m, v.dtype), given)
+        return 1 / (found + 1), (u, v, found), shift
 
-    v, (u, v_before, shift, found) = lax.scan(
-        one_pass, jnp.ones(m, points.dtype), None, length=passes
-    )
+    # The shift of a row is its largest entry, in every pass the same: the first one finds it.
+    v, first, shift = one_pass(jnp.ones(m, points.dtype))
+    v, others = lax.scan(lambda v, _: one_pass(v, shift)[:2], v, None, length=passes - 1)
+    u, v_before, found = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, others)
     weighted = v[:, None] * with_ones(points)
 
     def last(here):
-        rows, u = here
-        return u[:, None] * jnp.matmul(blocks.make(rows)[0], weighted, precision=_HIGHEST)
+        rows, shift, u = here
+        return u[:, None] * jnp.matmul(blocks.make(rows, shift)[0], weighted, precision=_HIGHEST)
 
-    sums = lax.map(last, (blocks.rows, u[-1])).reshape(-1, 4)[:n]
+    sums = lax.map(last, (blocks.rows, shift, u[-1])).reshape(-1, 4)[:n]
     result = match_of(sums, v * found[-1])
-    return result, (affinity, points, masks, u, v_before, v, shift[0], sums)
+    return result, (affinity, points, masks, u, v_before, v, shift, sums)
 
 
 def _backward(passes, most_rows, residuals, gradient):
