@@ -167,7 +167,7 @@ def _draw_modules(told, path):
     bars = axes.barh(names, [line["milliseconds"] for line in chosen])
     labels = ["" if line["share"] is None else f"{line['share']:.0%} of roof" for line in chosen]
     axes.bar_label(bars, labels, padding=3)
-    axes.margins(x=0.18)
+    axes.margins(x=0.3)
     axes.invert_yaxis()
     axes.set(xlabel="milliseconds of a pair of 717 points")
     figure.savefig(path, dpi=120)
