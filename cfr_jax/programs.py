@@ -3,8 +3,8 @@
 JAX's compilation cache is asked with a lowered program, and to trace and lower one takes longer
 than to load and run it. So where there is a folder for them (`keep_in`), lowered programs are kept
 as well, as `jax.export` writes them: StableHLO, nothing that could be run while it is read.
-Whatever could change a program is part of its name: the sources of this package, the versions and
-the options of JAX, the sizes of the arguments.
+Whatever could change a program is part of its name: the sources of this package, the versions of
+JAX, its options as far as the environment sets them, the sizes of the arguments.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import contextlib
 import functools
 import hashlib
 import os
-import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,11 +24,12 @@ import jaxlib
 from jax import export as jax_export
 
 _SHA256 = 32  # bytes, in front of each file
+_UNUSED = 30 * 24 * 3600.0  # seconds after which a program is thrown away
 _places: list[Path] = []  # where programs are kept; empty: nowhere
 
 
 def keep_in(folder: Path) -> None:
-    """From now on, lowered programs are kept in `folder`, those of these versions alone. Where
+    """From now on, lowered programs are kept in `folder`, a month after they were last used. Where
     nothing can be written, they are traced again, and nothing else happens."""
     _places[:] = [folder / _versions()]
 
@@ -55,7 +56,7 @@ def compiled(function: Callable, *arguments: Any, **static: Any) -> Callable:
 @functools.lru_cache(maxsize=64)
 def _program(function, static, structure, shapes):
     arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    if _places:
+    if _places and "<" not in function.__qualname__:  # two lambdas have one name
         name = _digest(function.__module__, function.__qualname__, static, structure, shapes)
         path = _places[0] / f"{function.__name__}-{name}.stablehlo"
         exported = _read(path) or _export(path, function, arguments, dict(static))
@@ -73,6 +74,8 @@ def _read(path):
     told, content = content[:_SHA256], content[_SHA256:]
     if told != hashlib.sha256(content).digest():
         return None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # used today
     return jax_export.deserialize(bytearray(content))
 
 
@@ -85,9 +88,7 @@ def _export(path, function, arguments, static):
         return None
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        for older in path.parent.parent.glob("programs-*"):
-            if older != path.parent:
-                shutil.rmtree(older, ignore_errors=True)
+        _throw_away_unused(path.parent.parent)
         path.parent.mkdir(parents=True, exist_ok=True)
         beside.write_bytes(hashlib.sha256(content).digest() + content)
         os.replace(beside, path)
@@ -95,6 +96,13 @@ def _export(path, function, arguments, static):
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
     return exported
+
+
+def _throw_away_unused(folder):
+    for path in folder.glob(f"programs-{24 * '[0-9a-f]'}/*-{24 * '[0-9a-f]'}.stablehlo*"):
+        with contextlib.suppress(OSError):
+            if time.time() - path.stat().st_mtime > _UNUSED:
+                path.unlink()
 
 
 def _versions() -> str:

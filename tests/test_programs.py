@@ -1,5 +1,7 @@
 """Lowered programs that are kept between processes: the same answers, and nothing that is stale."""
 
+import os
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,22 +22,24 @@ class Answer:
 programs.storable(Answer)
 
 
-def make(traced):
-    @jax.jit
-    def program(numbers, weights):
-        traced.append(1)
-        return Answer(jnp.sum(numbers * weights["scale"]), {"doubled": 2 * numbers})
+TRACED = []
 
-    return program
+
+@jax.jit
+def program(numbers, weights):
+    TRACED.append(1)
+    return Answer(jnp.sum(numbers * weights["scale"]), {"doubled": 2 * numbers})
 
 
 NUMBERS, WEIGHTS = jnp.arange(4.0), {"scale": jnp.float32(3)}
 
 
-def call(program):
+def call(function=program):
     """As a process of its own would: nothing is remembered but what lies in the folder."""
     programs._program.cache_clear()
-    return programs.compiled(program, NUMBERS, WEIGHTS)(NUMBERS, WEIGHTS)
+    function.clear_cache()
+    TRACED.clear()
+    return programs.compiled(function, NUMBERS, WEIGHTS)(NUMBERS, WEIGHTS)
 
 
 @pytest.fixture
@@ -53,19 +57,19 @@ def assert_right(answer):
 
 
 def test_a_kept_program_is_not_traced_again(folder):
-    first, second = [], []
+    assert_right(call())
+    assert TRACED
 
-    assert_right(call(make(first)))
-    assert_right(call(make(second)))
+    assert_right(call())
 
-    assert (len(first), len(second)) == (1, 0)
+    assert not TRACED
     assert len(list(folder.rglob("*.stablehlo"))) == 1
 
 
 @pytest.mark.parametrize("left", [0, 1, 32, 100, -1])
 @pytest.mark.parametrize("flipped", [False, True], ids=["cut off", "one bit flipped"])
 def test_a_damaged_one_is_made_again(folder, left, flipped):
-    call(make([]))
+    call()
     (path,) = folder.rglob("*.stablehlo")
     content = bytearray(path.read_bytes())
     if flipped:
@@ -73,33 +77,61 @@ def test_a_damaged_one_is_made_again(folder, left, flipped):
     else:
         del content[left:]
     path.write_bytes(content)
-    traced = []
 
-    assert_right(call(make(traced)))
+    assert_right(call())
 
-    assert traced
+    assert TRACED
 
 
-def test_other_versions_keep_their_own_and_the_old_ones_go(folder, monkeypatch):
-    call(make([]))
+def test_other_versions_keep_their_own(folder, monkeypatch):
+    call()
     monkeypatch.setattr(jax, "__version__", "other")
     programs.keep_in(folder)
-    traced = []
 
-    assert_right(call(make(traced)))
+    assert_right(call())
 
-    assert traced
-    assert len(list(folder.glob("programs-*"))) == 1
+    assert TRACED
+    assert len(list(folder.rglob("*.stablehlo"))) == 2
+
+
+def test_what_was_not_used_for_a_month_goes_and_nothing_else(folder, monkeypatch):
+    call()
+    (old,) = folder.rglob("*.stablehlo")
+    mine = folder / "programs-mine" / "thesis.stablehlo"
+    beside = old.with_name("notes.txt")
+    mine.parent.mkdir()
+    for path in (old, mine, beside):
+        path.touch()
+        os.utime(path, (0, 0))
+    monkeypatch.setattr(jax, "__version__", "other")
+    programs.keep_in(folder)
+
+    call()
+
+    assert not old.exists()
+    assert mine.exists() and beside.exists()
+
+
+def test_functions_that_share_a_name_are_not_mixed_up(folder):
+    double, triple = jax.jit(lambda n, w: 2 * n.sum()), jax.jit(lambda n, w: 3 * n.sum())
+
+    assert (call(double), call(triple)) == (12, 18)
+
+
+@struct.dataclass
+class Unknown:
+    """An answer that nothing was said of."""
+
+    value: jax.Array
+
+
+@jax.jit
+def unknown(numbers, weights):
+    return Unknown(numbers.sum())
 
 
 def test_what_cannot_be_kept_is_compiled_all_the_same(folder):
-    @struct.dataclass
-    class Unknown:
-        value: jax.Array
-
-    program = jax.jit(lambda numbers, weights: Unknown(numbers.sum()))
-
-    assert call(program).value == 6
+    assert call(unknown).value == 6
     assert not list(folder.rglob("*.stablehlo"))
 
 
@@ -108,5 +140,5 @@ def test_a_folder_that_cannot_be_written_costs_time_and_nothing_else(tmp_path, m
     monkeypatch.setattr(programs, "_places", [])
     programs.keep_in(tmp_path / "file")
 
-    assert_right(call(make([])))
+    assert_right(call())
     programs._program.cache_clear()
