@@ -1,6 +1,7 @@
 """The training step: it learns, skips what is not finite, and keeps geometry in float32."""
 
 import functools
+import re
 
 import jax
 import numpy as np
@@ -107,18 +108,19 @@ def test_prediction_answers_pair_after_pair(batch):
     np.testing.assert_allclose(predicted(backwards)[::-1], found, atol=1e-6)
 
 
-# The files whose products are those of the MLPs; all others are geometry, affinities, transport.
-MLPS = {"extraction.py", "layers.py", "pooling.py", "network.py", "linear.py"}
+# The rooms whose products are those of the MLPs; all others are geometry, affinities, transport.
+MLPS = {"extraction", "layers.py", "pooling.py", "network.py", "linear.py"}
 
 
 def products(jaxpr):
-    """Each matrix product in a program and what it calls: the file that asked for it, and how
+    """Each matrix product in a program and what it calls: the room that asked for it, and how
     precise."""
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
             files = [frame.file_name for frame in equation.source_info.traceback.frames]
             here = next(file for file in files if "/cfr_jax/" in file or "/flax/linen/" in file)
-            yield here.rsplit("/", 1)[1], equation.params["precision"]
+            room = re.split("/cfr_jax/|/flax/linen/", here)[-1].split("/")[0]
+            yield room, equation.params["precision"]
         for inner in jaxprs_in_params(equation.params):
             yield from products(inner)
 
@@ -139,8 +141,8 @@ def test_only_the_products_of_the_mlps_are_less_precise_and_all_is_stored_in_flo
         program = traced("bfloat16", backend)
         assert "bf16[" not in str(program)
         mixed = list(products(program))
-        assert {file for file, _ in mixed} & MLPS and {file for file, _ in mixed} - MLPS
+        assert {room for room, _ in mixed} & MLPS and {room for room, _ in mixed} - MLPS
         # what becomes a variance there stays at full precision
-        less = {file for file, precision in mixed if precision == wanted}
-        assert less == {file for file, _ in mixed} & MLPS
+        less = {room for room, precision in mixed if precision == wanted}
+        assert less == {room for room, _ in mixed} & MLPS
         assert all(precision in (wanted, highest) for _, precision in mixed)
