@@ -35,7 +35,7 @@ def keep_in(folder: Path) -> None:
 
 
 def storable(*nodes: type) -> None:
-    """Says that answers made of these dataclasses of arrays can be kept."""
+    """Says that programs can be kept that take or answer these dataclasses of arrays."""
     for node in nodes:
         jax_export.register_pytree_node_serialization(
             node,
@@ -59,9 +59,11 @@ def _program(function, static, structure, shapes):
     if _places and "<" not in function.__qualname__:  # two lambdas have one name
         name = _digest(function.__module__, function.__qualname__, static, structure, shapes)
         path = _places[0] / f"{function.__name__}-{name}.stablehlo"
-        exported = _read(path) or _export(path, function, arguments, dict(static))
-        if exported is not None:
-            return jax.jit(exported.call).lower(*arguments).compile()
+        exported = _read(path)
+        if exported is None:
+            exported = jax_export.export(function)(*arguments, **dict(static))
+            _keep(path, exported)
+        return jax.jit(exported.call).lower(*arguments).compile()
     return function.lower(*arguments, **dict(static)).compile()
 
 
@@ -79,13 +81,12 @@ def _read(path):
     return jax_export.deserialize(bytearray(content))
 
 
-def _export(path, function, arguments, static):
-    """The exported program, kept at `path` if possible; None for answers that cannot be kept."""
+def _keep(path, exported):
+    """Writes the program to `path`, if there is room, and it is made of what is `storable`."""
     try:
-        exported = jax_export.export(function)(*arguments, **static)
         content = exported.serialize()
     except ValueError:
-        return None
+        return
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         _throw_away_unused(path.parent.parent)
@@ -95,7 +96,6 @@ def _export(path, function, arguments, static):
     except OSError:
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
-    return exported
 
 
 def _throw_away_unused(folder):

@@ -17,7 +17,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Float
 
-from cfr_jax import planning, preparation, quality, refinement, rigid
+from cfr_jax import planning, preparation, programs, quality, refinement, rigid
 from cfr_jax.io import PointCloud
 from cfr_jax.registration import Settings, encode, prepare, register
 from cfr_jax.rotations import cover
@@ -60,6 +60,9 @@ class Candidates:
 
     motions: Float[Array, "k 4 4"]
     fits: Float[Array, " k"]
+
+
+programs.storable(Candidates)
 
 
 @functools.partial(jax.jit, static_argnames=("kept", "at_once"))

@@ -40,7 +40,15 @@ class Found:
     clues: confidence.Clues
 
 
-programs.storable(Found, Registration, quality.Quality, confidence.Clues, confidence.NetworkClues)
+programs.storable(
+    Cloud,
+    Encoded,
+    Registration,
+    Found,
+    quality.Quality,
+    confidence.Clues,
+    confidence.NetworkClues,
+)
 
 
 def solve(params: dict, source: Cloud, target: Encoded, *, refine: bool) -> Found:

@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import solids
 from flax import struct
 
-from cfr_jax import programs
+from cfr_jax import align, align_many, programs
 
 
 @struct.dataclass
@@ -127,12 +128,24 @@ class Unknown:
 
 @jax.jit
 def unknown(numbers, weights):
+    TRACED.append(1)
     return Unknown(numbers.sum())
 
 
 def test_what_cannot_be_kept_is_compiled_all_the_same(folder):
     assert call(unknown).value == 6
+    assert TRACED == [1]
     assert not list(folder.rglob("*.stablehlo"))
+
+
+def test_all_programs_of_the_command_line_can_be_kept(folder):
+    source, target = (solids.lopsided(60, seed, 0.003).points for seed in (0, 1))
+
+    align(source, target, initial="global")
+    list(align_many([(source, target)]))
+
+    kept = {path.name.split("-")[0] for path in folder.rglob("*.stablehlo")}
+    assert kept == {"propose", "polish", "solve_pair", "encode_target", "solve_many"}
 
 
 def test_a_folder_that_cannot_be_written_costs_time_and_nothing_else(tmp_path, monkeypatch):
