@@ -26,10 +26,10 @@ from scipy.optimize import minimize
 from benchmarks import reliability
 from cfr_jax import calibration, confidence, metrics
 from cfr_jax.alignment import align
+from cfr_jax.atomic import write_atomically
 from cfr_jax.cli.cache import keep_compiled_programs
 from cfr_jax.data.corpus import Corpus, read_corpus
 from cfr_jax.data.protocol import low_overlap, partial, partial_any_rotation, random_pair
-from cfr_jax.viewer.atomic import write_atomically
 
 OF_NETWORK = tuple(field.name for field in dataclasses.fields(confidence.NetworkClues))
 OF_SURFACES = tuple(f.name for f in dataclasses.fields(confidence.Clues) if f.name != "network")

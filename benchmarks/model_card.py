@@ -13,9 +13,9 @@ import datetime
 import json
 
 from cfr_jax import __version__, cards, reproduction
+from cfr_jax.atomic import write_atomically
 from cfr_jax.evaluation import machine
 from cfr_jax.progress import Progress
-from cfr_jax.viewer.atomic import write_atomically
 from cfr_jax.weights import load_params
 
 

@@ -20,6 +20,7 @@ from jax import export as jax_export
 from jaxtyping import Array, Float, Int32
 from numpy.typing import ArrayLike
 
+from cfr_jax.atomic import write_atomically
 from cfr_jax.registration import Settings, prepare, register
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -84,14 +85,7 @@ def export_register(
 
 def save_exported(path: str | os.PathLike[str], exported: jax_export.Exported) -> None:
     """Writes the program, beside and then renamed."""
-    path = Path(path)
-    content = exported.serialize()
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        beside.write_bytes(content)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    write_atomically(path, bytes(exported.serialize()))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,6 +23,8 @@ import jax
 import jaxlib
 from jax import export as jax_export
 
+from cfr_jax.atomic import write_atomically
+
 _SHA256 = 32  # bytes, in front of each file
 _UNUSED = 30 * 24 * 3600.0  # seconds after which a program is thrown away
 _places: list[Path] = []  # where programs are kept; empty: nowhere
@@ -87,15 +89,10 @@ def _keep(path, exported):
         content = exported.serialize()
     except ValueError:
         return
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with contextlib.suppress(OSError):
         _throw_away_unused(path.parent.parent)
         path.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_bytes(hashlib.sha256(content).digest() + content)
-        os.replace(beside, path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            beside.unlink(missing_ok=True)
+        write_atomically(path, hashlib.sha256(content).digest() + content)
 
 
 def _throw_away_unused(folder):

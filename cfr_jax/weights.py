@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import hashlib
 import json
-import os
 from pathlib import Path
 
 import jax
@@ -17,6 +16,7 @@ from safetensors.numpy import save_file
 
 from cfr_jax import network as cfr_network
 from cfr_jax import rpmnet
+from cfr_jax.atomic import unfinished
 
 SHIPPED = Path(__file__).parent / "models"
 DEFAULT = "object"
@@ -47,14 +47,11 @@ def save_params(path: str | Path, params: dict, notes: dict[str, str] | None = N
     """
     path, notes = Path(path), dict(notes or {})
     tensors = {name: np.asarray(leaf) for name, leaf in flatten_dict(params, sep="/").items()}
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        save_file(tensors, beside, metadata=notes | {"sha256": _digest(tensors, notes)})
-        os.replace(beside, path)
+        with unfinished(path) as beside:
+            save_file(tensors, beside, metadata=notes | {"sha256": _digest(tensors, notes)})
     except (SafetensorError, OSError) as error:
         raise OSError(f"weights: {path} could not be written ({error})") from error
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def load_params(source: str | Path = DEFAULT, network: str = "cfr") -> dict:

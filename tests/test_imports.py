@@ -24,6 +24,7 @@ LAYERS = (
     ("confidence",),
     ("registration",),
     ("rpmnet",),
+    ("atomic",),
     ("losses", "metrics", "weights", "progress", "cards", "export", "programs"),
     ("convert",),
     ("io",),
@@ -44,7 +45,7 @@ LAYERS = (
 # Rooms that know less than their place would let them.
 KNOWS_ONLY = {
     "io": set(),
-    "viewer": {"io"},
+    "viewer": {"io", "atomic"},
     "data": {"io", "neighbors", "progress"},
     "metrics": set(),
 }

@@ -176,8 +176,8 @@ def _register(left: list[Job], journal: Journal, params: dict, args: argparse.Na
 
 
 def _tell(records: list[dict[str, Any]], out: Path, kept: Path, strict: bool) -> int:
+    from cfr_jax.atomic import write_atomically
     from cfr_jax.batch.records import as_table
-    from cfr_jax.viewer.atomic import write_atomically
 
     write_atomically(out, as_table(records).encode())
     failed = [record for record in records if record["error"] is not None]

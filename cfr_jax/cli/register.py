@@ -211,7 +211,7 @@ def _check_outputs(args: argparse.Namespace, to_stdout: bool) -> None:
 
 
 def _write_json(path: Path | None, document: dict) -> None:
-    from cfr_jax.viewer.atomic import write_atomically
+    from cfr_jax.atomic import write_atomically
 
     text = json.dumps(document, indent=2, allow_nan=False) + "\n"
     if path is None:

@@ -45,9 +45,9 @@ def run(args: argparse.Namespace) -> int:
     card = cards.read_card(args.name)
 
     from cfr_jax import __version__, reproduction
+    from cfr_jax.atomic import write_atomically
     from cfr_jax.cli.cache import keep_compiled_programs
     from cfr_jax.progress import Progress
-    from cfr_jax.viewer.atomic import write_atomically
     from cfr_jax.weights import load_params
 
     keep_compiled_programs()

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool
 from tqdm import tqdm
 
+from cfr_jax.atomic import write_atomically
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation import machine
 from cfr_jax.evaluation.datasets import read_pairs
@@ -21,7 +22,6 @@ from cfr_jax.evaluation.records import Records
 from cfr_jax.evaluation.running import run_method
 from cfr_jax.evaluation.symmetry import nearly_symmetric
 from cfr_jax.evaluation.tables import Numbers, write_table
-from cfr_jax.viewer.atomic import write_atomically
 
 
 def compare(

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from cfr_jax import metrics
+from cfr_jax.atomic import write_atomically
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.measuring import Measured
-from cfr_jax.viewer.atomic import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from cfr_jax.viewer.atomic import write_atomically
+from cfr_jax.atomic import write_atomically
 
 _WIDTH, _HEIGHT, _LEFT, _BELOW, _ABOVE = 460, 220, 52, 28, 14
 _COLORS = ("#0a6ebd", "#d9822b", "#2e8b57", "#8e44ad", "#7f8c8d")
