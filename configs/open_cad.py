@@ -38,7 +38,7 @@ def get_config() -> ConfigDict:
     config.sampling.estimated_normals = 0.4
 
     config.train = ConfigDict()
-    config.train.optimizer = "adamw"  # or adam, lion, sgd
+    config.train.optimizer = "adamw"  # or adam, lion, sgd, muon
     config.train.schedule = "cosine"  # or wsd (warm-up, stable, decay), constant
     config.train.peak_rate = 1e-3
     config.train.warmup = 0.1  # share of all steps

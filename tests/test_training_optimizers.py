@@ -78,6 +78,30 @@ def test_the_gradient_is_clipped_by_its_norm():
     np.testing.assert_allclose(long, 2 * np.array(short), rtol=1e-5)
 
 
+def test_muon_moves_hidden_matrices_alike_in_all_directions_and_the_rest_as_adamw():
+    def drawn(*shape):
+        return jnp.asarray(np.random.default_rng(0).normal(size=shape), jnp.float32)
+
+    gradient = {"stack": drawn(2, 48, 96), "input": drawn(7, 96), "bias": drawn(96)}
+    zeros = jax.tree.map(jnp.zeros_like, gradient)
+    rule = make_optimizer("muon", lambda _: 0.1, clip=1e9, weight_decay=0.0)
+
+    updates, _ = rule.update(gradient, rule.init(zeros), zeros)
+
+    # 0.2 times the root of the longer side makes entries about 0.2 in size, as AdamW's are
+    lengths = np.linalg.svd(updates["stack"], compute_uv=False) / (0.1 * 0.2 * np.sqrt(96))
+    assert 0.6 < lengths.min() and lengths.max() < 1.3
+    left, _, right = np.linalg.svd(np.asarray(gradient["stack"], float), full_matrices=False)
+    aligned = np.einsum("sij,sij->s", updates["stack"], -left @ right)
+    np.testing.assert_allclose(
+        aligned / np.linalg.norm(updates["stack"], axis=(1, 2)), 48**0.5, rtol=0.05
+    )
+    for name in ("input", "bias"):
+        # Nesterov's first step is 1 + 0.9 / (1 + 0.9) long, shrunk by less than a hundredth
+        first = 0.1 * (1 + 0.9 / 1.9)
+        np.testing.assert_allclose(updates[name], -first * np.sign(gradient[name]), rtol=1e-2)
+
+
 @pytest.mark.parametrize(
     ("change", "wanted"),
     [
