@@ -10,7 +10,7 @@ def get_config() -> ConfigDict:
     config.data = ConfigDict()
     config.data.kind = "corpus"
     config.data.path = "../shared/data/open_cad/test.h5"  # any file in the ModelNet40 layout
-    config.data.protocol = "partial"  # clean, noise, low_overlap, partial_any_rotation
+    config.data.protocol = "partial"  # or clean, noise, low_overlap
     config.limit = 300  # pairs; 0 for all
     config.seed = 0
     config.weights = "object"
@@ -74,8 +74,6 @@ def methods() -> dict:
         },
         "cfr": network("cfr") | {"modules": True},
         "cfr_refined": network("cfr", refine=True),
-        # for data.protocol = "partial_any_rotation"
-        "cfr_global": network("cfr", refine=True, through="align", initial="global"),
         "cfr_estimated": network("cfr", estimated=True),
         "cfr_estimated_refined": network("cfr", refine=True, estimated=True),
         # as published; with the paper's speed-ups, which the others have, it answers the same
