@@ -1,11 +1,9 @@
-"""As `eval_open_cad.py`, turned by any rotation: for methods that need no start near the truth."""
+"""As `eval_open_cad.py`, turned by any rotation, and with the search over all of them."""
 
 import runpy
 from pathlib import Path
 
 from ml_collections import ConfigDict
-
-_METHODS = ("cfr", "fgr_icp", "ransac", "kiss_matcher")  # as `eval_open_cad.py` sets them
 
 
 def get_config() -> ConfigDict:
@@ -16,7 +14,6 @@ def get_config() -> ConfigDict:
     config.title = "Open CAD shapes, partial pairs turned by any rotation"
     config.data.protocol = "partial_any_rotation"
     config.limit = 150  # the search takes seconds a pair
-    config.methods = ConfigDict({name: config.methods[name] for name in _METHODS})
     config.methods.cfr_global = known["network"](
         "cfr", refine=True, through="align", initial="global"
     )

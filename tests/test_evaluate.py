@@ -115,6 +115,20 @@ def test_no_config_gives_a_baseline_an_option_that_it_does_not_take(path):
         assert needed - {"options"} <= options, name
 
 
+def test_without_normals_the_methods_are_the_same_and_none_is_given_any():
+    config = read_module(ROOT / "configs" / "eval_open_cad.py")
+    exact, estimated = (
+        config.get_config(kind).methods.to_dict() for kind in ("exact", "estimated")
+    )
+
+    assert {"cfr_estimated", "fgr_icp_estimated", "rpmnet_optim_estimated"} <= set(estimated)
+    for name, entry in estimated.items():
+        assert entry["estimated_normals"] is True
+        assert entry["use"] == exact[name.removesuffix("_estimated")]["use"]
+    assert not any(entry.get("estimated_normals") for entry in exact.values())
+    assert len(methods_of(config.get_config("estimated"), [], seed=0)) == len(estimated)
+
+
 def test_what_an_ablation_trains_is_what_it_measures():
     from cfr_jax.evaluation.network import make_network
     from cfr_jax.training.learner import learner
