@@ -50,7 +50,6 @@ def exact() -> dict:
         # as published; with the paper's speed-ups, which the others have, it answers the same
         "rpmnet": network("rpmnet", settings={"optimized": False}) | {"modules": True},
         "rpmnet_optim": network("rpmnet") | {"modules": True},
-        "rpmnet_optim_refined": network("rpmnet", refine=True),
     }
 
 
@@ -62,7 +61,6 @@ def estimated() -> dict:
         "cfr_refined": network("cfr", refine=True),
         "cfr_two_hours": network("cfr") | {"weights": "cfr_two_hours"},
         "rpmnet_optim": network("rpmnet"),
-        "rpmnet_optim_refined": network("rpmnet", refine=True),
     }
     return {
         f"{name}_estimated": each | {"estimated_normals": True} for name, each in chosen.items()
