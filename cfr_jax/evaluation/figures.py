@@ -133,6 +133,8 @@ def by_iteration(path: Path, measured: Sequence[Measured], unit: str) -> None:
 
 def time_against_accuracy(path: Path, measured: Sequence[Measured], about: dict[str, Any]) -> None:
     """Each method a point: how long it takes, and how good it is."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     figure = new_figure(11, 4.2)
     left, right = figure.subplots(1, 2)
     for style, m in _styled(measured):
@@ -144,6 +146,10 @@ def time_against_accuracy(path: Path, measured: Sequence[Measured], about: dict[
             axes.plot([time], [value], marker="o", ms=9, **style | {"ls": ""})
     for axes in (left, right):
         axes.set(xscale="log", xlabel="ms per pair")
+        # less than two decades: powers of ten alone would say little
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
     left.set(ylabel="mean rotation error (degrees)")
     right.set(ylabel=_recall_label(about), ylim=(-0.02, 1.02))
     _finish(figure, path)
@@ -161,7 +167,9 @@ def time_by_module(path: Path, measured: Sequence[Measured]) -> None:
         times = [(m.modules or {}).get(part, 0) * 1e3 for part in parts]
         across = np.arange(len(parts)) + (place - (len(measured) - 1) / 2) * width
         bars = axes.bar(across, times, width, color=style["color"], label=m.name)
-        axes.bar_label(bars, [f"{time:.3g}" for time in times], fontsize=7)
+        axes.bar_label(
+            bars, [f"{time:.3g}" if time < 100 else f"{time:.0f}" for time in times], fontsize=7
+        )
     axes.set_xticks(range(len(parts)), parts)
     axes.set(yscale="log", ylabel="ms per pair")
     _finish(figure, path)
