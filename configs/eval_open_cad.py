@@ -55,15 +55,11 @@ def exact() -> dict:
 
 def estimated() -> dict:
     """Those that take normals, called NAME_estimated; RPM-Net once, since both answer the same."""
-    chosen = {
-        **by_features(0.45),
-        "cfr": network("cfr"),
-        "cfr_refined": network("cfr", refine=True),
-        "cfr_two_hours": network("cfr") | {"weights": "cfr_two_hours"},
-        "rpmnet_optim": network("rpmnet"),
-    }
+    known = exact() | by_features(0.45)
+    chosen = (*by_features(0.45), "cfr", "cfr_refined", "cfr_two_hours", "rpmnet_optim")
     return {
-        f"{name}_estimated": each | {"estimated_normals": True} for name, each in chosen.items()
+        f"{name}_estimated": known[name] | {"estimated_normals": True, "modules": False}
+        for name in chosen
     }
 
 
