@@ -56,7 +56,8 @@ def exact() -> dict:
 def estimated() -> dict:
     """Those that take normals, called NAME_estimated; RPM-Net once, since both answer the same."""
     known = exact() | by_features(0.45)
-    chosen = (*by_features(0.45), "cfr", "cfr_refined", "cfr_two_hours", "rpmnet_optim")
+    networks = ("cfr", "cfr_refined", "cfr_two_hours", "rpmnet_optim")
+    chosen = ("icp_plane", *by_features(0.45), *networks)
     return {
         f"{name}_estimated": known[name] | {"estimated_normals": True, "modules": False}
         for name in chosen
