@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from timing import compiled, program
 
 import cfr_jax as cfr
-from cfr_jax import registration, rigid, rpmnet, sinkhorn
+from cfr_jax import iterations, registration, rigid, rpmnet, sinkhorn
 from cfr_jax.features import raw_features
 from cfr_jax.neighbors import nearest, nearest_on_host
 
@@ -72,7 +72,7 @@ def modules(count: int) -> Iterator[Case]:
     params = cfr.load_params()
     x, y = clouds.pair(count)
     a, b = prepared(count)
-    network = registration.bind(params)
+    network = iterations.bind(params)
     raw = [raw_features(c.points, c.normals, c.neighbors) for c in (a, b)]
     base = [network.features(channels) for channels in raw]
     rows = [network.cascade.at_rest(f, c.points) for f, c in zip(base, (a, b), strict=True)]
@@ -82,7 +82,7 @@ def modules(count: int) -> Iterator[Case]:
         return Case(group, name, count, lambda: compiled(function, *arguments), flop)
 
     def features(params, raw):
-        return [registration.bind(params).features(channels) for channels in raw]
+        return [iterations.bind(params).features(channels) for channels in raw]
 
     def matched(rows):
         return [

@@ -22,14 +22,15 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cfr_jax import network, registration
+from cfr_jax import network
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.batches import ShapeSource, batch_at
 from cfr_jax.data.corpus import Corpus
+from cfr_jax.iterations import unroll
 from cfr_jax.layers import apply_layer
 from cfr_jax.losses import pair_loss
 from cfr_jax.neighbors import nearest_on_host
-from cfr_jax.registration import Cloud
+from cfr_jax.prepared import Cloud, Settings
 from cfr_jax.training import devices, optimizers, step
 
 
@@ -53,8 +54,8 @@ def main() -> None:
           f"{args.batch}, {args.repeats} repeats, milliseconds\n")  # fmt: skip
     cpu = jax.default_backend() == "cpu"
     recipe = step.Recipe(
-        unroll=registration.unroll,
-        settings=registration.Settings(neighbors=args.neighbors, detach_motion=True),
+        unroll=unroll,
+        settings=Settings(neighbors=args.neighbors, detach_motion=True),
         optimizer=optimizer,
         mesh=devices.make_mesh(),
         pairs_at_once=1 if cpu else args.batch // len(jax.devices()),
@@ -108,8 +109,8 @@ def naive_step(state: step.TrainState, *, batch, optimizer, neighbors):
             Cloud(pair[side], pair[f"{side}_normals"], by_top_k(pair[side], neighbors, 0.3))
             for side in ("source", "target")
         ]
-        settings = registration.Settings(neighbors=neighbors, detach_motion=True)
-        found = registration.unroll(params, *clouds, settings)
+        settings = Settings(neighbors=neighbors, detach_motion=True)
+        found = unroll(params, *clouds, settings)
         return pair_loss(found, *clouds, pair["transform"], correspondence_weight=0.05).total
 
     def mean_loss(params):

@@ -10,7 +10,8 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from cfr_jax import rigid
-from cfr_jax.registration import Cloud, Step
+from cfr_jax.iterations import Step
+from cfr_jax.prepared import Cloud
 
 _DISCOUNT = 0.5  # the last iteration counts fully, each one before it half of the next
 _INLIER_WEIGHT = 0.01

@@ -16,6 +16,7 @@ from cfr_jax.registration import Settings
 
 DEFAULT_BUDGET = 1024
 SETTINGS = Settings()
+CASCADES = 2  # chosen on validation pairs (docs/training.md)
 
 
 @dataclass(frozen=True, eq=False)

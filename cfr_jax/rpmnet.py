@@ -19,10 +19,11 @@ from jaxtyping import Array, Bool, Float, Int32
 from cfr_jax import rigid
 from cfr_jax.extraction import pooled_features
 from cfr_jax.features import raw_features
+from cfr_jax.iterations import Step
 from cfr_jax.layers import apply_layer
 from cfr_jax.neighbors import first_in_ball
 from cfr_jax.network import GROUPS, AnnealingNet, kernel_init, layer_of, unit_rows
-from cfr_jax.registration import Cloud, Step, moved_by
+from cfr_jax.prepared import Cloud, moved_by
 from cfr_jax.sinkhorn import Affinity, match
 
 _WIDTHS = (96, 96, 192)

@@ -17,7 +17,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from cfr_jax import confidence, programs, quality, refinement
-from cfr_jax.planning import SETTINGS
+from cfr_jax.planning import CASCADES, SETTINGS
 from cfr_jax.preparation import UnitCloud
 from cfr_jax.refinement import Surface
 from cfr_jax.registration import Cloud, Encoded, Registration, encode, prepare, register
@@ -57,7 +57,7 @@ def solve(params: dict, source: Cloud, target: Encoded, *, refine: bool) -> Foun
     Refining never answers worse, by its own score, than the network did or than the source lay
     when it came: a start that fits better than all that was found from it stands.
     """
-    registration = register(params, source, target, settings=SETTINGS)
+    registration = register(params, source, target, cascades=CASCADES, settings=SETTINGS)
     surfaces = surface(source), surface(target.cloud)
     transform = registration.transform
     improved = converged = jnp.array(False)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 import cfr_jax
-from cfr_jax import alignment, io, metrics, registration
+from cfr_jax import alignment, io, iterations, metrics, registration
 from cfr_jax.cli.cache import keep_compiled_programs
 
 IMAGES = Path(__file__).parent / "images"
@@ -142,7 +142,7 @@ def unit_pair(source, target, found):
         clouds = [registration.prepare(part, settings=settings) for part in (source, target)]
         return [
             (step.transform, step.affinity.log())
-            for step in registration.unroll(params, *clouds, settings)
+            for step in iterations.unroll(params, *clouds, settings)
         ]
 
     unit = [np.asarray(part / scale, np.float32) for part in points]

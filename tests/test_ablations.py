@@ -7,8 +7,9 @@ import pytest
 from oracle import authors, cfr, clouds
 
 from cfr_jax.convert import from_state_dict
+from cfr_jax.iterations import iterations_of
 from cfr_jax.network import init_params
-from cfr_jax.registration import Settings, iterations_of, register
+from cfr_jax.registration import Settings, register
 
 K = 8
 ITERATIONS = 2

@@ -38,14 +38,16 @@ def test_nothing_asked_for_changes_nothing(sphere):
     assert not pair["estimate_normals"]
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_everything_together_leaves_the_truth_true(sphere, seed):
+@pytest.mark.parametrize(("seed", "centered"), [(0, 0.0), (1, 0.0), (2, 1.0), (3, 1.0)])
+def test_everything_together_leaves_the_truth_true(sphere, seed, centered):
     truth = np.eye(4)
     truth[:3, :3] = Rotation.random(random_state=seed).as_matrix()
     truth[:3, 3] = 0.3, -0.2, 0.1
     source = View((sphere - truth[:3, 3].astype(np.float32)) @ truth[:3, :3].astype(np.float32),
                   sphere @ truth[:3, :3].astype(np.float32))  # fmt: skip
-    sampling = still(any_orientation=1.0, scale=(0.5, 2.0), angle=45.0, translation=0.5)
+    sampling = still(
+        any_orientation=1.0, scale=(0.5, 2.0), angle=45.0, translation=0.5, centered=centered
+    )
 
     pair = finish_pair(source, View(sphere, sphere), truth, sampling, np.random.default_rng(seed))
 
@@ -63,6 +65,44 @@ def test_orientation_turns_as_many_shapes_as_asked(sphere):
     turned = sum(np.abs(target - sphere).max() > 1e-3 for target in targets)
     assert 40 <= turned <= 80
     np.testing.assert_allclose(np.linalg.norm(targets, axis=-1), 1, atol=1e-5)
+
+
+def euler_angles(sphere, **changes):
+    """Of the motions of 300 pairs, degrees; the truth undoes what was done to the source."""
+    made = [drawn(sphere, still(angle=45.0, **changes), seed)["transform"] for seed in range(300)]
+    undone = [Rotation.from_matrix(transform[:3, :3].T) for transform in made]
+    return np.array([rotation.as_euler("XYZ", degrees=True) for rotation in undone])
+
+
+def test_both_ways_turns_as_many_pairs_as_asked_about_each_axis_either_way(sphere):
+    one_way, mixed, any_way = (euler_angles(sphere, both_ways=share) for share in (0.0, 0.4, 1.0))
+
+    assert one_way.min() > -1e-3 and np.abs(any_way).max() < 45.001
+    for angles, negative in ((mixed, 0.2), (any_way, 0.5)):
+        np.testing.assert_allclose((angles < 0).mean(axis=0), negative, atol=0.08)
+    assert any_way.min() < -40 and any_way.max() > 40
+
+
+def test_centered_clouds_lie_about_their_centroids_as_often_as_asked(sphere):
+    half, sampling = sphere[sphere[:, 2] > 0], still(translation=0.5, centered=0.4)
+
+    pairs = [drawn(half, sampling, seed) for seed in range(200)]
+
+    apart = np.array([[np.linalg.norm(pair[side].mean(axis=0)) for side in ("source", "target")]
+                      for pair in pairs])  # fmt: skip
+    assert 60 <= (apart < 1e-6).all(axis=1).sum() <= 100
+    assert ((apart < 1e-6).all(axis=1) | (apart > 1e-6).all(axis=1)).all()
+
+
+def test_near_shrinks_as_many_motions_as_asked(sphere):
+    far, mixed, near = (euler_angles(sphere, near=share) for share in (0.0, 0.5, 1.0))
+
+    # the mean of an angle is 22.5, and of one shrunken by [0, 1] half of that
+    for angles, wanted in ((far, 22.5), (mixed, 16.9), (near, 11.25)):
+        assert abs(angles.mean() - wanted) < 2
+    shift = [drawn(sphere, still(translation=0.5, near=1.0), seed) for seed in range(300)]
+    away = np.abs([pair["transform"][:3, 3] for pair in shift])
+    assert abs(away.mean() - 0.125) < 0.02
 
 
 def test_scale_stretches_both_clouds_by_one_factor_within_its_range(sphere):

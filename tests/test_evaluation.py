@@ -331,7 +331,8 @@ def test_the_gallery_shows_best_median_and_worst_and_no_pair_twice():
     assert chosen(few) == {"best": [0, 1, 2], "median": [], "worst": [3]}
 
 
-def test_a_batch_answers_as_each_pair_alone(tmp_path, params):
+@pytest.mark.parametrize("cascades", [1, 2])
+def test_a_batch_answers_as_each_pair_alone(tmp_path, params, cascades):
     import jax.numpy as jnp
 
     from cfr_jax.evaluation.network import make_network
@@ -342,7 +343,11 @@ def test_a_batch_answers_as_each_pair_alone(tmp_path, params):
     save_params(tmp_path / "w.safetensors", params)
     pairs = [a_pair(seed, points=70) for seed in range(3)]
     solve = make_network(
-        network="cfr", weights=str(tmp_path / "w.safetensors"), refine=False, batch=2
+        network="cfr",
+        weights=str(tmp_path / "w.safetensors"),
+        refine=False,
+        batch=2,
+        cascades=cascades,
     )
 
     # when
@@ -352,7 +357,7 @@ def test_a_batch_answers_as_each_pair_alone(tmp_path, params):
     assert len(found) == 3
     for pair, answer in zip(pairs, found, strict=True):
         clouds = (jnp.asarray(cloud, jnp.float32) for cloud in (pair.source, pair.target))
-        alone = register(params, *clouds).transforms
+        alone = register(params, *clouds, cascades=cascades).transforms
         np.testing.assert_allclose(answer.transforms, alone, atol=2e-4)
         assert 0 < answer.seconds < 60
 
@@ -399,6 +404,8 @@ def test_a_network_goes_through_register_or_align_and_nothing_else(unchecked):
 
     with pytest.raises(ValueError, match="through is 'luck'"):
         network.make_network(network="cfr", weights="w", refine=True, through="luck")
+    with pytest.raises(ValueError, match="cascades is 0"):
+        network.make_network(network="cfr", weights="w", refine=True, cascades=0)
 
 
 def a_network(tmp_path, network: str, **options):
@@ -494,7 +501,7 @@ def test_a_prepared_cloud_has_the_size_of_the_network_and_its_padding_changes_no
 def test_the_modules_that_are_timed_are_those_of_a_registration(tmp_path, network):
     import jax.numpy as jnp
 
-    from cfr_jax import registration, rigid, rpmnet
+    from cfr_jax import iterations, prepared, rigid, rpmnet
     from cfr_jax.evaluation import modules
 
     # given the parts of a registration of one iteration
@@ -505,9 +512,9 @@ def test_the_modules_that_are_timed_are_those_of_a_registration(tmp_path, networ
         params["cascade"] = {name: leaf[:1] for name, leaf in params["cascade"].items()}
         out = params["annealing"]["out"]
         params["annealing"]["out"] = {name: leaf[..., [0, 5]] for name, leaf in out.items()}
-        small = registration.Settings(**settings)
+        small = prepared.Settings(**settings)
         parts = modules._Cfr(params, small)
-        (motion,) = motions(registration.unroll, params, source, target, small)
+        (motion,) = motions(iterations.unroll, params, source, target, small)
     else:
         small = rpmnet.Settings(**settings, iterations=1)
         parts = modules._Rpmnet(params, small)
@@ -536,7 +543,7 @@ def test_each_module_is_counted_as_often_as_it_runs(
 ):
     from collections import Counter
 
-    from cfr_jax import registration, rpmnet
+    from cfr_jax import prepared, rpmnet
     from cfr_jax.evaluation import modules
 
     class Anything:  # a result that can be taken apart in every way
@@ -548,7 +555,7 @@ def test_each_module_is_counted_as_often_as_it_runs(
 
     monkeypatch.setattr(modules.jax, "jit", lambda function, **_: lambda *_: Anything())
     _, params = a_network(tmp_path, network)
-    kind = {"cfr": registration.Settings, "rpmnet": rpmnet.Settings}[network]
+    kind = {"cfr": prepared.Settings, "rpmnet": rpmnet.Settings}[network]
     parts = {"cfr": modules._Cfr, "rpmnet": modules._Rpmnet}[network](params, kind(**settings))
     counted = Counter()
     for part in parts.of(*modules._clouds(a_pair(), estimated=True)):

@@ -22,6 +22,8 @@ LAYERS = (
     ("refinement", "calibration"),
     ("quality",),
     ("confidence",),
+    ("prepared",),
+    ("iterations",),
     ("registration",),
     ("rpmnet",),
     ("atomic",),
@@ -49,7 +51,7 @@ KNOWS_ONLY = {
     "data": {"io", "neighbors", "progress"},
     "metrics": set(),
 }
-NUMERICAL_CORE = {name for layer in LAYERS[:9] for name in layer} | {"losses"}
+NUMERICAL_CORE = {name for layer in LAYERS[:11] for name in layer} | {"losses"}
 # Arrays in, arrays out: no files, no configuration, no host program around it.
 CORE_MAY_USE = {
     "__future__", "collections", "dataclasses", "functools", "math", "typing",

@@ -9,8 +9,9 @@ import pytest
 from oracle import authors, cfr, clouds, pieces
 
 from cfr_jax.convert import from_state_dict
+from cfr_jax.iterations import unroll
 from cfr_jax.losses import correspondence_loss, pair_loss
-from cfr_jax.registration import Settings, prepare, unroll
+from cfr_jax.prepared import Settings, prepare
 
 SMALL = Settings(neighbors=6)
 N, M, L = 24, 28, 2

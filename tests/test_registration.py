@@ -11,8 +11,10 @@ from oracle import authors, cfr, clouds, pieces
 from cfr_jax import registration
 from cfr_jax.convert import from_state_dict
 from cfr_jax.features import raw_features
+from cfr_jax.iterations import bind
 from cfr_jax.neighbors import nearest_on_host
-from cfr_jax.registration import Settings, bind, encode, prepare, register
+from cfr_jax.prepared import Settings, moved_by, prepare
+from cfr_jax.registration import encode, register
 
 K = 16
 SMALL = Settings(neighbors=K)
@@ -177,7 +179,7 @@ def test_compiled_or_not_is_the_same(params):
     compiled = register(params, source, target, iterations=1, settings=settings)
 
     plain = registration._register.__wrapped__(
-        params, source, target, iterations=1, settings=settings
+        params, source, target, iterations=1, cascades=1, settings=settings
     )
 
     close(plain.transforms, compiled.transforms)
@@ -237,6 +239,23 @@ def test_iterations_beyond_the_parameters_repeat_the_last_layer():
         moved = pieces.move(wanted, pair.x)
 
 
+def test_a_second_cascade_is_a_registration_from_where_the_first_ended(params, pair, answer):
+    # given
+    source, target = (prepare(cloud, settings=SMALL) for cloud in both(pair))
+    moved = moved_by(answer.transform, source)
+    again = register(params, moved, target, iterations=2, settings=SMALL)
+
+    # when
+    found = register(params, source, target, iterations=2, cascades=2, settings=SMALL)
+
+    # then
+    close(found.transforms[:2], answer.transforms)
+    close(found.transforms[2:], again.transforms @ answer.transform, atol=1e-4)
+    close(found.beta, jnp.concatenate([answer.beta, again.beta]), atol=1e-4)
+    close(found.weights, again.weights, atol=1e-4)
+    close(found.targets, again.targets, atol=1e-4)
+
+
 def test_a_cloud_smaller_than_k_has_fewer_neighbors(params):
     source, target = both(clouds.random_pair(4, 20, 22))
 
@@ -255,6 +274,7 @@ def test_a_cloud_smaller_than_k_has_fewer_neighbors(params):
         ("source", {"source": jnp.zeros(70)}),
         ("target", {"target": jnp.zeros((2, 80, 3))}),
         ("iterations", {"iterations": 0}),
+        ("cascades", {"cascades": 0}),
         ("k", {"settings": Settings(neighbors=0)}),
     ],
 )

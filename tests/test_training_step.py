@@ -10,7 +10,7 @@ import training_samples as samples
 from jax.extend.core import jaxprs_in_params
 from training_samples import BATCH, NEIGHBORS, POINTS, assert_same, fresh, recipe
 
-from cfr_jax import network, registration
+from cfr_jax import iterations, network
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.batches import ShapeSource, batch_at
 from cfr_jax.data.corpus import read_corpus
@@ -96,7 +96,7 @@ def test_prediction_answers_pair_after_pair(batch):
     predicted = functools.partial(
         predict,
         params,
-        unroll=registration.unroll,
+        unroll=iterations.unroll,
         settings=samples.SETTINGS,
         mesh=devices.make_mesh(),
     )

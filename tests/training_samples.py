@@ -7,12 +7,12 @@ import jax
 import numpy as np
 from ml_collections import ConfigDict
 
-from cfr_jax import network, registration
+from cfr_jax import iterations, network, prepared
 from cfr_jax.training import devices, step
 from cfr_jax.training.optimizers import make_optimizer, make_schedule
 
 POINTS, NEIGHBORS, BATCH, STEPS = 24, 6, 2, 16
-SETTINGS = registration.Settings(neighbors=NEIGHBORS, detach_motion=True)
+SETTINGS = prepared.Settings(neighbors=NEIGHBORS, detach_motion=True)
 
 
 @functools.cache
@@ -24,7 +24,7 @@ def optimizer():
 def recipe(**changes):
     """The one recipe of all tests, so that it compiles once."""
     given = {
-        "unroll": registration.unroll,
+        "unroll": iterations.unroll,
         "settings": SETTINGS,
         "optimizer": optimizer(),
         "mesh": devices.make_mesh(),

@@ -16,7 +16,15 @@ from scipy.spatial.transform import Rotation
 from cfr_jax.data.protocol import NOISE_CLIP, NOISE_SCALE, random_motion, resample, way_back
 from cfr_jax.neighbors import nearest_on_host
 
-_SHARES = ("any_orientation", "uneven", "sensor_noise", "estimated_normals")
+_SHARES = (
+    "both_ways",
+    "near",
+    "centered",
+    "any_orientation",
+    "uneven",
+    "sensor_noise",
+    "estimated_normals",
+)
 _RANGES = ("keep", "scale", "density", "outliers", "noise", "sensor_scale")
 _SENSOR_AWAY = (2.0, 4.0)  # of a sensor from the middle of what it sees
 
@@ -35,6 +43,15 @@ class Sampling:
     """Degrees; each Euler angle of the motion is drawn from [0, angle]."""
     translation: float = 0.5
     """Each coordinate of the motion is drawn from [-translation, translation]."""
+    both_ways: float = 0.0
+    """Share whose Euler angles are drawn from [-angle, angle] instead: the protocol's pairs are
+    turned one way only, those of users any way."""
+    near: float = 0.0
+    """Share whose motion is smaller, by a factor drawn from [0, 1]: such is what a first cascade
+    leaves to a second."""
+    centered: float = 0.0
+    """Share whose clouds lie about their own centroids, as `align` hands them over; the others
+    about the middle of the shape, which a crop does not show."""
     any_orientation: float = 0.0
     """Share whose shape is first turned at random: CAD models stand upright, scans may not."""
     scale: tuple[float, float] = (1.0, 1.0)
@@ -120,29 +137,42 @@ def finish_pair(
     if rng.random() < sampling.any_orientation:
         turn = Rotation.random(random_state=rng).as_matrix()
     scale = rng.uniform(*sampling.scale)
-    motion = random_motion(sampling.angle, sampling.translation, rng)
+    motion = _motion(sampling, rng)
+    centered = rng.random() < sampling.centered
     sensor = rng.random() < sampling.sensor_noise
     estimate = rng.random() < sampling.estimated_normals
     turned = np.eye(4)
     turned[:3, :3] = turn @ truth[:3, :3] @ turn.T
     turned[:3, 3] = scale * (turn @ truth[:3, 3])
-    pair = {
-        "transform": (turned @ way_back(motion)).astype(np.float32),
-        "estimate_normals": estimate or source.normals is None or target.normals is None,
-    }
+    pair = {"estimate_normals": estimate or source.normals is None or target.normals is None}
+    moved = {}
     for side, view, placed in (("source", source, motion), ("target", target, np.eye(4))):
         rotation = placed[:3, :3] @ turn
         points = scale * (view.points @ rotation.T) + placed[:3, 3]
         normals = np.zeros_like(points) if view.normals is None else view.normals @ rotation.T
         points = (add_sensor_noise if sensor else add_noise)(points, sampling, rng)
         points, normals = add_outliers(points, normals, sampling, rng)
-        points = points.astype(np.float32)
+        middle = centered * points.mean(axis=0)
+        moved[side] = np.eye(4)
+        moved[side][:3, 3] = -middle
+        points = (points - middle).astype(np.float32)
         pair[side] = points
         pair[f"{side}_normals"] = normals.astype(np.float32)
         pair[f"{side}_neighbors"] = nearest_on_host(
             points, sampling.neighbors, radius=sampling.radius
         )
-    return pair
+    truth = moved["target"] @ turned @ way_back(motion) @ np.linalg.inv(moved["source"])
+    return pair | {"transform": truth.astype(np.float32)}
+
+
+def _motion(sampling, rng):
+    factor = rng.random() if rng.random() < sampling.near else 1.0
+    angle, translation = factor * sampling.angle, factor * sampling.translation
+    motion = random_motion(angle, translation, rng)
+    if rng.random() < sampling.both_ways:
+        turn = Rotation.from_euler("XYZ", rng.uniform(-angle, angle, 3), degrees=True)
+        motion[:3, :3] = turn.as_matrix()
+    return motion
 
 
 def add_noise(

@@ -15,13 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfr_jax import registration, rigid, rpmnet
+from cfr_jax import rigid, rpmnet
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.methods import clouds_of
 from cfr_jax.features import raw_features
+from cfr_jax.iterations import bind, iterations_of
 from cfr_jax.neighbors import nearest_on_host
 from cfr_jax.normals import estimate_normals
-from cfr_jax.registration import Cloud
+from cfr_jax.prepared import Cloud, Settings
 from cfr_jax.sinkhorn import Affinity, match
 from cfr_jax.weights import load_params
 
@@ -47,7 +48,7 @@ def make_modules(
     if network == "rpmnet":
         parts = _Rpmnet(params, rpmnet.Settings(**settings or {}))
     else:
-        parts = _Cfr(params, registration.Settings(**settings or {}))
+        parts = _Cfr(params, Settings(**settings or {}))
     return lambda pairs: [seconds_of(parts.of(*_clouds(pair, estimated))) for pair in pairs]
 
 
@@ -66,9 +67,9 @@ def seconds_of(parts: Iterator[Part]) -> dict[str, float]:
 
 
 class _Cfr:
-    def __init__(self, params: dict, settings: registration.Settings):
-        self.settings, self.count = settings, registration.iterations_of(params)
-        network = registration.bind(params)
+    def __init__(self, params: dict, settings: Settings):
+        self.settings, self.count = settings, iterations_of(params)
+        network = bind(params)
         self.heavy = jax.jit(lambda cloud: _raw_cfr(network, cloud, settings))
         self.light = jax.jit(lambda *cloud: network.cascade.at_rest(*cloud))
         self.annealing = jax.jit(lambda *clouds: network.annealing(*clouds))
@@ -148,10 +149,8 @@ def _clouds(pair: Pair, estimated: bool) -> list[Cloud]:
     found = []
     for cloud in clouds_of(pair, estimated):
         points = jnp.asarray(cloud.points, jnp.float32)
-        k = min(registration.Settings().neighbors, len(points) - 1)
-        neighbors = jnp.asarray(
-            nearest_on_host(np.asarray(points), k, radius=registration.Settings().radius)
-        )
+        k = min(Settings().neighbors, len(points) - 1)
+        neighbors = jnp.asarray(nearest_on_host(np.asarray(points), k, radius=Settings().radius))
         normals = estimate_normals(points, neighbors)
         if cloud.normals is not None:
             normals = jnp.asarray(cloud.normals, jnp.float32)

@@ -14,19 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfr_jax import programs, refinement, registration, rpmnet, solving
+from cfr_jax import programs, refinement, rigid, rpmnet, solving
 from cfr_jax.alignment import align
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.methods import Answer, Solver, clouds_of
+from cfr_jax.iterations import Step, unroll
 from cfr_jax.neighbors import nearest_on_host
 from cfr_jax.normals import estimate_normals
 from cfr_jax.planning import planned
-from cfr_jax.registration import Cloud, Step
+from cfr_jax.prepared import Cloud, Settings, moved_by
 from cfr_jax.weights import load_params
 
 Unroll = Callable[[dict, Cloud, Cloud, Any], Iterator[Step]]
 KINDS: dict[str, tuple[Unroll, Any]] = {
-    "cfr": (registration.unroll, registration.Settings),
+    "cfr": (unroll, Settings),
     "rpmnet": (rpmnet.unroll, rpmnet.Settings),
 }
 """By name: its iterations, and the settings of these."""
@@ -40,6 +41,7 @@ class Program:
     settings: Any
     refine: bool
     vectorized: int
+    cascades: int = 1
 
 
 def make_network(
@@ -52,12 +54,13 @@ def make_network(
     estimated: bool = False,
     batch: int = 1,
     vectorized: int = 1,
+    cascades: int = 1,
     max_points: int | None = None,
     initial: Literal["global"] | None = None,
     seed: int = 0,
 ) -> Solver:
     """A network of `KINDS` with these weights, `settings` other than its usual ones, with or
-    without refinement after its last iteration.
+    without refinement after its last iteration, `cascades` times one after the other.
 
     "register" takes the clouds as they are, `batch` pairs a call, `vectorized` of them at a time
     (one keeps a CPU's caches warm, an accelerator wants many); the time of a pair is its share of
@@ -67,9 +70,11 @@ def make_network(
     """
     if through not in ("register", "align", "preparation"):
         raise ValueError(f"through is {through!r}, wanted 'register', 'align' or 'preparation'")
+    if cascades < 1:
+        raise ValueError(f"cascades is {cascades}, wanted at least 1")
     params = load_params(weights, network)
     if through == "align":
-        if network != "cfr" or settings:
+        if network != "cfr" or settings or cascades != 1:
             raise ValueError("through 'align' is CFR as it is; wanted 'preparation' for others")
         return functools.partial(
             _align_each,
@@ -83,7 +88,7 @@ def make_network(
     if initial is not None:
         raise ValueError(f"initial is {initial!r}, which needs through='align'")
     unroll, made = KINDS[network]
-    program = Program(unroll, made(**settings or {}), refine, vectorized)
+    program = Program(unroll, made(**settings or {}), refine, vectorized, cascades)
     if through == "preparation":
         return functools.partial(_prepare_each, params, program, estimated, max_points, seed)
     return functools.partial(_register_batches, params, program, estimated, batch)
@@ -110,7 +115,7 @@ def _prepare_each(
     seed: int,
     pairs: Sequence[Pair],
 ) -> list[Answer]:
-    unit = registration.Settings(program.settings.neighbors, program.settings.radius)
+    unit = Settings(program.settings.neighbors, program.settings.radius)
     answers = []
     for pair in pairs:
         clouds = clouds_of(pair, estimated)
@@ -194,8 +199,7 @@ def _solve(
 ) -> Float[Array, "b i 4 4"]:
     def of_pair(pair):
         source, target = (_with_normals(cloud) for cloud in pair)
-        steps = program.unroll(params, source, target, program.settings)
-        transforms = jnp.stack([step.transform for step in steps])
+        transforms = _transforms(program, params, source, target)
         if not program.refine:
             return transforms
         surfaces = solving.surface(source), solving.surface(target)
@@ -204,6 +208,20 @@ def _solve(
 
     size = program.vectorized if program.vectorized > 1 else None
     return jax.lax.map(of_pair, (sources, targets), batch_size=size)
+
+
+def _transforms(
+    program: Program, params: dict, source: Cloud, target: Cloud
+) -> Float[Array, "i 4 4"]:
+    """Of all cascades, each started where the one before it ended."""
+
+    def cascade(start, _):
+        steps = program.unroll(params, moved_by(start, source), target, program.settings)
+        transforms = jnp.stack([rigid.compose(step.transform, start) for step in steps])
+        return transforms[-1], transforms
+
+    start = jnp.eye(4, dtype=source.points.dtype)
+    return jax.lax.scan(cascade, start, length=program.cascades)[1].reshape(-1, 4, 4)
 
 
 def _with_normals(cloud: Cloud) -> Cloud:

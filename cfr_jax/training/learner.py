@@ -8,10 +8,10 @@ from typing import Any
 
 import jax
 
-from cfr_jax import network, registration, rpmnet
+from cfr_jax import iterations, network, prepared, rpmnet
 from cfr_jax.training.step import Unroll
 
-AnySettings = registration.Settings | rpmnet.Settings
+AnySettings = prepared.Settings | rpmnet.Settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,11 +43,9 @@ def learner(config: Any) -> Learner:
             fresh=lambda key: network.init_params(
                 key, config.iterations, config.get("shared", False)
             ),
-            unroll=registration.unroll,
-            trained=lambda count: registration.Settings(
-                neighbors=count, detach_motion=True, **changed
-            ),
-            validated=registration.Settings(**changed),
+            unroll=iterations.unroll,
+            trained=lambda count: prepared.Settings(neighbors=count, detach_motion=True, **changed),
+            validated=prepared.Settings(**changed),
         )
     if config.network == "rpmnet":
         return Learner(

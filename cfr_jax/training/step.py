@@ -14,13 +14,14 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Int
 
+from cfr_jax.iterations import Step
 from cfr_jax.losses import PairLoss, pair_loss
 from cfr_jax.normals import estimate_normals
-from cfr_jax.registration import Cloud, Step
+from cfr_jax.prepared import Cloud
 from cfr_jax.training.devices import AXIS
 
 Unroll = Callable[[dict, Cloud, Cloud, Hashable], Iterator[Step]]
-"""The iterations of a network on a pair: `registration.unroll`, or `rpmnet.unroll`."""
+"""The iterations of a network on a pair: `iterations.unroll`, or `rpmnet.unroll`."""
 
 PRECISIONS = ("float32", "tensorfloat32", "bfloat16")
 
