@@ -29,7 +29,7 @@ class Alignment:
     transform: Float[np.ndarray, "4 4"]
     """Maps source onto target: `transform @ [x; 1]` lies on the target. Float64."""
     transforms: Float[np.ndarray, "L 4 4"]
-    """What the network answered, one per iteration, before any refinement."""
+    """What the network answered, one per iteration of its two cascades, before any refinement."""
     refined: bool
     """Whether `transform` is not the network's last, but an answer that fits no worse: the
     refinement's, or the start where that fits better still."""
@@ -116,10 +116,10 @@ def align(
     Clouds are (n, 3) arrays, (n, 6) with normals, paths, or what else `io.as_point_cloud` takes.
     They are centered and scaled in float64, thinned to `max_points` each (default 1,024; `seed`
     says which), given normals where they have none, registered by the network with `params`
-    (default: the weights that ship) and refined by `refinement.refine`, by the library small_gicp
-    (`refine="small_gicp"`), or not at all (False). Refining never makes the score worse. With
-    `all_points` it is refined further on every point there is (`pyramid`); `fitness` and
-    `inlier_rmse` are then of all points, too.
+    (default: the weights that ship) in two cascades, and refined by `refinement.refine`, by the
+    library small_gicp (`refine="small_gicp"`), or not at all (False). Refining never makes the
+    score worse. With `all_points` it is refined further on every point there is (`pyramid`);
+    `fitness` and `inlier_rmse` are then of all points, too.
 
     `initial` (4, 4) moves the source close to the target first; without it the centroids are laid
     on each other. The network is trained for up to 45 degrees about each axis from there. Several

@@ -44,7 +44,9 @@ def exact() -> dict:
         },
         **by_features(0.3),
         "cfr": network("cfr") | {"modules": True},
-        "cfr_refined": network("cfr", refine=True),
+        # as `align` has it: a second cascade from where the first ended, then the refinement
+        "cfr_twice": network("cfr", cascades=2),
+        "cfr_refined": network("cfr", cascades=2, refine=True),
         # trained as long as RPM-Net was (configs/two_hours.py); left out where the file is not
         "cfr_two_hours": network("cfr") | {"weights": "cfr_two_hours"},
         # as published; with the paper's speed-ups, which the others have, it answers the same
@@ -56,7 +58,7 @@ def exact() -> dict:
 def estimated() -> dict:
     """Those that take normals, called NAME_estimated; RPM-Net once, since both answer the same."""
     known = exact() | by_features(0.45)
-    networks = ("cfr", "cfr_refined", "cfr_two_hours", "rpmnet_optim")
+    networks = ("cfr", "cfr_twice", "cfr_refined", "cfr_two_hours", "rpmnet_optim")
     chosen = ("icp_plane", *by_features(0.45), *networks)
     return {
         f"{name}_estimated": known[name] | {"estimated_normals": True, "modules": False}

@@ -71,7 +71,7 @@ def test_the_answer_describes_every_used_point(pair, answer):
     assert answer.source_rows.tolist() == answer.target_rows.tolist() == list(range(500))
     assert answer.weights.shape == (500,)
     assert (answer.weights >= 0).all() and (answer.weights <= 1 + 1e-5).all()
-    assert answer.neighbors == 64 and answer.transforms.shape == (5, 4, 4)
+    assert answer.neighbors == 64 and answer.transforms.shape == (10, 4, 4)
     assert answer.trusted == (answer.determined and answer.confidence >= 0.5)
     assert bool(answer.warnings) == (not answer.trusted)
 

@@ -336,7 +336,7 @@ def test_the_real_thing_finds_a_known_motion_twice_alike(pair, tmp_path, capsys)
     assert {**first, "seconds": None} == {**second, "seconds": None}
     truth, found = cli_samples.motion(), np.array(first["transform"])
     np.testing.assert_allclose(found, truth, atol=0.03)
-    assert first["trusted"] and first["refined"] and len(first["transforms"]) == 5
+    assert first["trusted"] and first["refined"] and len(first["transforms"]) == 10
     moved = cli_samples.points(700, 0) @ found[:3, :3].T + found[:3, 3]
     np.testing.assert_allclose(np.load(tmp_path / "moved.npy"), moved, atol=1e-12)
     assert capsys.readouterr().err == ""
