@@ -4,12 +4,14 @@
     python -m benchmarks.fit_confidence --corpus ../shared/data/open_cad/test.h5 --pairs 300 \\
         --figure docs/images/confidence.png
 
-Of ten pairs three are of the partial protocol with exact normals and two with estimated ones; two
-keep only half of each shape (one with estimated normals); one is turned by any rotation and
-searched globally; one is turned by up to 90 degrees about each axis and is not; and one is of two
-different shapes. The first form cross-validates by shape, then fits to all pairs and writes
-cfr_jax/calibration.py. The second measures what ships on shapes that it was not fitted to, and
-draws. `--clues FILE.npz` keeps what was gathered: a call that was cut off goes on from there.
+Of ten pairs three are of the partial protocol with exact normals and two with estimated ones, three
+of these five turned either way about each axis instead of one; two keep only half of each shape
+(one with estimated normals); one is turned by any rotation and searched globally; one is turned by
+up to 90 degrees about each axis and is not; and one is of two different shapes.
+
+The first form cross-validates by shape, then fits to all pairs and writes cfr_jax/calibration.py.
+The second measures what ships on shapes that it was not fitted to, and draws. `--clues FILE.npz`
+keeps what was gathered: a call that was cut off goes on from there.
 """
 
 from __future__ import annotations
@@ -19,26 +21,38 @@ import dataclasses
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import tqdm
 from scipy.optimize import minimize
 
 from benchmarks import reliability
-from cfr_jax import calibration, confidence, metrics
+from cfr_jax import calibration, confidence, metrics, solving
 from cfr_jax.alignment import align
 from cfr_jax.atomic import write_atomically
 from cfr_jax.cli.cache import keep_compiled_programs
 from cfr_jax.data.corpus import Corpus, read_corpus
-from cfr_jax.data.protocol import low_overlap, partial, partial_any_rotation, random_pair
+from cfr_jax.data.protocol import (
+    low_overlap,
+    partial,
+    partial_any_rotation,
+    partial_both_ways,
+    random_pair,
+)
+from cfr_jax.planning import SETTINGS, planned
+from cfr_jax.registration import prepare, register
+from cfr_jax.weights import load_params
 
 OF_NETWORK = tuple(field.name for field in dataclasses.fields(confidence.NetworkClues))
 OF_SURFACES = tuple(f.name for f in dataclasses.fields(confidence.Clues) if f.name != "network")
 CLUES = OF_NETWORK + OF_SURFACES
+USED = {"REGISTER": OF_NETWORK, "ALIGN": CLUES}
 _PENALTY = 1e-3  # on the squared weights: clues overlap
 _TURNED = dataclasses.replace(partial, name="turned", angle=90.0)
 # protocol, whether normals are estimated
 _MIX = (
-    *[(partial, False)] * 3, *[(partial, True)] * 2, (low_overlap, False), (low_overlap, True),
+    (partial, False), *[(partial_both_ways, False)] * 2, (partial, True),
+    (partial_both_ways, True), (low_overlap, False), (low_overlap, True),
     (partial_any_rotation, False), (_TURNED, False), (partial, True),
 )  # fmt: skip
 _SEARCHED, _DIFFERENT = 7, 9  # places in the mix
@@ -49,8 +63,8 @@ _FOLDS = 5
 class Gathered:
     """What was found of `n` pairs: clues, whether register and align were right, the shape."""
 
-    clues: np.ndarray
-    right: np.ndarray
+    clues: dict[str, np.ndarray]
+    right: dict[str, np.ndarray]
     shape: np.ndarray
 
 
@@ -59,12 +73,16 @@ def gather(corpus: Corpus, count: int, seed: int, kept: Path | None) -> Gathered
     rows: list[list[float]] = []
     if kept is not None and kept.exists():
         rows = np.load(kept)["rows"][:count].tolist()
+        if len(rows[0]) != len(OF_NETWORK) + len(CLUES) + 3:
+            raise SystemExit(f"fit_confidence: error: {kept} holds other clues; wanted a new file")
     for number in tqdm.trange(len(rows), count, initial=len(rows), total=count):
         rows.append(_row(corpus, number, np.random.default_rng((seed, number))))
         if kept is not None and (len(rows) % 10 == 0 or len(rows) == count):
             np.savez(kept, rows=np.array(rows))
     held = np.array(rows)
-    return Gathered(held[:, :-3], held[:, -3:-1].astype(bool), held[:, -1].astype(int))
+    clues = {"REGISTER": held[:, : len(OF_NETWORK)], "ALIGN": held[:, len(OF_NETWORK) : -3]}
+    right = dict(zip(clues, held[:, -3:-1].T.astype(bool), strict=True))
+    return Gathered(clues, right, held[:, -1].astype(int))
 
 
 def _row(corpus, number, rng):
@@ -75,15 +93,24 @@ def _row(corpus, number, rng):
     if number % len(_MIX) == _DIFFERENT:
         target = random_pair(*corpus[other], protocol, rng)
     clouds = (pair.source, pair.source_normals), (target.target, target.target_normals)
-    found = align(
-        *(points if estimated else np.hstack([points, normals]) for points, normals in clouds),
-        initial="global" if number % len(_MIX) == _SEARCHED else None,
-    )
-    answers = np.stack([found.transforms[-1], found.transform])
+    given = [points if estimated else np.hstack([points, normals]) for points, normals in clouds]
+    found = align(*given, initial="global" if number % len(_MIX) == _SEARCHED else None)
+    # `register` alone makes one cascade
+    plan = planned(*given, initial=found.initial)
+    arguments = solving.on_device(plan.source), solving.on_device(plan.target)
+    alone = _register(load_params(), *arguments)
+    answers = np.stack([plan.frames.to_caller(np.asarray(alone.transform)), found.transform])
     truth = np.repeat(pair.transform[None].astype(float), 2, axis=0)
     errors = metrics.err_r(answers, truth), metrics.err_t(answers, truth)
     right = metrics.recalled(*errors, 5.0, 0.1) & (target is pair)
-    return [*(found.clues[name] for name in CLUES), *right, shape]
+    of_network = (float(getattr(alone.clues, name)) for name in OF_NETWORK)
+    return [*of_network, *(found.clues[name] for name in CLUES), *right, shape]
+
+
+@jax.jit
+def _register(params, source, target):
+    clouds = (prepare(**cloud, settings=SETTINGS) for cloud in (source, target))
+    return register(params, *clouds, settings=SETTINGS)
 
 
 def fit(clues: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -119,7 +146,7 @@ def cross_validated(clues: np.ndarray, right: np.ndarray, shape: np.ndarray) -> 
 def shipped(name: str, clues: np.ndarray) -> np.ndarray:
     """The probability of each answer by what ships."""
     fitted = getattr(calibration, name)
-    weights = [fitted.get(clue, 0.0) for clue in CLUES]
+    weights = [fitted[clue] for clue in USED[name]]
     return predict(np.array([*weights, fitted["bias"]]), clues)
 
 
@@ -135,27 +162,23 @@ def main() -> None:
     args = parser.parse_args()
     keep_compiled_programs()
     found = gather(read_corpus(args.corpus), args.pairs, args.seed, args.clues)
-    used = {"REGISTER": OF_NETWORK, "ALIGN": CLUES}
-    chances = {}
-    for (name, clues), right in zip(used.items(), found.right.T, strict=True):
-        columns = found.clues[:, [CLUES.index(clue) for clue in clues]]
-        chances[name] = chance = (
-            cross_validated(columns, right, found.shape) if args.fit else shipped(name, found.clues)
-        )
+    curves = {}
+    for name, right in found.right.items():
+        clues = found.clues[name]
+        chance = cross_validated(clues, right, found.shape) if args.fit else shipped(name, clues)
+        curves[name.lower()] = chance, right
         print(name, json.dumps(reliability.summary(chance, right)))
     if args.fit:
-        _write_calibration(used, found)
+        _write_calibration(found)
     if args.figure is not None:
-        labels = ("register", "align")
-        curves = zip(labels, chances.values(), found.right.T, strict=True)
-        reliability.draw(args.figure, {label: (c, right) for label, c, right in curves})
+        reliability.draw(args.figure, curves)
 
 
-def _write_calibration(used: dict[str, tuple[str, ...]], found: Gathered) -> None:
+def _write_calibration(found: Gathered) -> None:
     lines = [confidence.calibration.__doc__.rstrip("\n")]
     text = f'"""{lines[0]}\n"""\n'
-    for (name, clues), right in zip(used.items(), found.right.T, strict=True):
-        fitted = fit(found.clues[:, [CLUES.index(clue) for clue in clues]], right)
+    for name, clues in USED.items():
+        fitted = fit(found.clues[name], found.right[name])
         text += f'\n{name} = {{\n    "bias": {fitted[-1]:.4f},\n'
         text += "".join(f'    "{c}": {w:.4f},\n' for c, w in zip(clues, fitted[:-1], strict=True))
         text += "}\n"

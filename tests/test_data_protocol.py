@@ -3,6 +3,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cfr_jax.data import protocol as protocols
 from cfr_jax.data.corpus import Corpus
@@ -146,6 +147,21 @@ def test_euler_angles_and_translations_fill_their_ranges():
     assert 0 <= y.min() < 0.5 and 44.5 < y.max() <= 45
     assert motions[:, :3, 3].min() < -0.49 and motions[:, :3, 3].max() > 0.49
     np.testing.assert_allclose(np.linalg.det(motions), 1, atol=1e-6)
+
+
+def test_both_ways_draws_the_same_pairs_turned_either_way():
+    # given each angle uniform in [-45, 45] instead of [0, 45]
+    one, both = (
+        protocols.random_motion(45.0, 0.5, np.random.default_rng(7), both_ways=ways)
+        for ways in (False, True)
+    )
+
+    # then
+    def angles(motion):
+        return Rotation.from_matrix(motion[:3, :3]).as_euler("XYZ", degrees=True)
+
+    np.testing.assert_allclose(angles(both), 2 * angles(one) - 45, atol=1e-4)
+    np.testing.assert_array_equal(one[:3, 3], both[:3, 3])
 
 
 @pytest.mark.parametrize("legacy", [True, False])

@@ -166,13 +166,10 @@ def finish_pair(
 
 
 def _motion(sampling, rng):
+    both_ways = rng.random() < sampling.both_ways
     factor = rng.random() if rng.random() < sampling.near else 1.0
-    angle, translation = factor * sampling.angle, factor * sampling.translation
-    motion = random_motion(angle, translation, rng)
-    if rng.random() < sampling.both_ways:
-        turn = Rotation.from_euler("XYZ", rng.uniform(-angle, angle, 3), degrees=True)
-        motion[:3, :3] = turn.as_matrix()
-    return motion
+    reach = factor * sampling.angle, factor * sampling.translation
+    return random_motion(*reach, rng, both_ways=both_ways)
 
 
 def add_noise(

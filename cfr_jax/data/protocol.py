@@ -37,6 +37,7 @@ class Protocol:
     keep: float | None = None  # share of the shape that a crop leaves
     noise: bool = True  # N(0, 0.01), clipped to 0.05
     angle: float | None = 45.0  # degrees; each Euler angle from [0, angle]; None: any rotation
+    both_ways: bool = False  # each angle from [-angle, angle] instead, as users' clouds may be
     translation: float = 0.5  # each coordinate is drawn from [-translation, translation]
 
     def __post_init__(self):
@@ -50,6 +51,7 @@ clean = Protocol("clean", noise=False)
 noise = Protocol("noise")
 partial = Protocol("partial", keep=0.7)
 low_overlap = Protocol("low_overlap", keep=0.5)
+partial_both_ways = Protocol("partial_both_ways", keep=0.7, both_ways=True)
 partial_any_rotation = Protocol("partial_any_rotation", keep=0.7, angle=None)
 
 
@@ -112,16 +114,21 @@ def crop(points: Float[np.ndarray, "p 3"], keep: float, rng: Rng) -> Int[np.ndar
     return kept
 
 
-def random_motion(angle: float | None, translation: float, rng: Rng) -> Float32[np.ndarray, "4 4"]:
+def random_motion(
+    angle: float | None, translation: float, rng: Rng, *, both_ways: bool = False
+) -> Float32[np.ndarray, "4 4"]:
     """R = Rx Ry Rz with each angle in [0, angle] degrees, then a translation within a cube.
 
-    Without an angle the rotation is any, uniform over SO(3): that of a random unit quaternion.
+    `both_ways` draws the angles from [-angle, angle]. Without an angle the rotation is any, uniform
+    over SO(3): that of a random unit quaternion.
     """
     motion = np.eye(4)
     if angle is None:
         motion[:3, :3] = Rotation.from_quat(rng.normal(size=4)).as_matrix()
     else:
         x, y, z = (rng.uniform() * np.pi * angle / 180.0 for _ in range(3))
+        if both_ways:
+            x, y, z = (2 * drawn - np.pi * angle / 180.0 for drawn in (x, y, z))
         about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
         about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
         about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
@@ -176,7 +183,7 @@ def _make_pair(
         count = math.ceil(np.float32(protocol.keep) * count)
 
     rng = reseed()
-    motion = random_motion(protocol.angle, protocol.translation, rng)
+    motion = random_motion(protocol.angle, protocol.translation, rng, both_ways=protocol.both_ways)
     rotation = motion[:3, :3]
     moved, moved_normals = points @ rotation.T + motion[:3, 3], normals @ rotation.T
 

@@ -23,6 +23,7 @@ _PROTOCOLS = {
         protocol.noise,
         protocol.partial,
         protocol.low_overlap,
+        protocol.partial_both_ways,
         protocol.partial_any_rotation,
     )
 }
