@@ -26,17 +26,17 @@ def main(_) -> None:
     name = _ABLATION.value
     if name not in known["ABLATIONS"]:
         raise SystemExit(f"ablate.py: error: no ablation {name!r}: {', '.join(known['ABLATIONS'])}")
-    config = known["get_config"](name)
+    steps = "" if _STEPS.value is None else f",{_STEPS.value}"
+    config = known["get_config"](name + steps)
     for variant in config.trainings:
-        chosen = variant if _STEPS.value is None else f"{variant},{_STEPS.value}"
         _run(
             "train.py",
-            f"--config={_HERE / 'configs' / 'ablations.py'}:{chosen}",
+            f"--config={_HERE / 'configs' / 'ablations.py'}:{variant}{steps}",
             f"--workdir={config.runs}/{variant}",
         )
     _run(
         "evaluate.py",
-        f"--config={_EVALUATION}:{name}",
+        f"--config={_EVALUATION}:{name}{steps}",
         f"--limit={_LIMIT.value}",
         f"--out={_OUT.value or f'results/ablations/{name}'}",
     )

@@ -21,7 +21,8 @@ from jaxtyping import Array, Float, Int32
 from numpy.typing import ArrayLike
 
 from cfr_jax.atomic import write_atomically
-from cfr_jax.registration import Settings, prepare, register
+from cfr_jax.prepared import Settings, prepare
+from cfr_jax.registration import register
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 OUTPUTS = ("transform", "transforms", "weights", "covered")

@@ -9,7 +9,7 @@ The definitions are those of RPM-Net (Yew & Lee, 2020), so that numbers stand be
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -120,35 +120,8 @@ def bootstrap(
     return Statistic(float(statistic(values, axis=-1)), float(low), float(high))
 
 
-def summary(
-    estimates: Motions,
-    truths: Motions,
-    chamfers: Errors | None = None,
-    thresholds: Sequence[tuple[float, float]] = ((1.0, 0.1), (5.0, 2.0)),
-    seed: int = 0,
-) -> dict[str, Statistic]:
-    """What a report says of P pairs: mean and median errors, and recall, each with its interval.
-
-    `r_rmse` and `t_rmse` are the root over all axes of all pairs, not a mean of roots. Thresholds
-    are (degrees, length); recall at (5, 0.1) is called `recall_5deg_0.1`.
-    """
-    angles, distances = err_r(estimates, truths), err_t(estimates, truths)
-    report = {}
-    for name, values in (("err_r", angles), ("err_t", distances), ("chamfer", chamfers)):
-        if values is not None:
-            report[f"{name}_mean"] = bootstrap(values, np.mean, seed=seed)
-            report[f"{name}_median"] = bootstrap(values, np.median, seed=seed)
-    report["r_mae"] = bootstrap(r_mae(estimates, truths), seed=seed)
-    report["r_rmse"] = bootstrap(r_rmse(estimates, truths), _root_mean_square, seed=seed)
-    report["t_mae"] = bootstrap(t_mae(estimates, truths), seed=seed)
-    report["t_rmse"] = bootstrap(t_rmse(estimates, truths), _root_mean_square, seed=seed)
-    for angle, distance in thresholds:
-        hits = recalled(angles, distances, angle, distance).astype(float)
-        report[f"recall_{angle:g}deg_{distance:g}"] = bootstrap(hits, seed=seed)
-    return report
-
-
-def _root_mean_square(values: np.ndarray, axis: int) -> np.ndarray | np.floating:
+def root_mean_square(values: np.ndarray, axis: int) -> np.ndarray | np.floating:
+    """A statistic for `bootstrap`: the root over all axes of all pairs, not a mean of roots."""
     return np.sqrt(np.square(values).mean(axis=axis))
 
 

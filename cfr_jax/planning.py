@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from cfr_jax import preparation
 from cfr_jax.io import PointCloud, as_point_cloud
-from cfr_jax.registration import Settings
+from cfr_jax.prepared import Settings
 
 DEFAULT_BUDGET = 1024
 SETTINGS = Settings()

@@ -26,7 +26,8 @@ class Registration:
     """Answer of `register`."""
 
     transforms: Float[Array, "L 4 4"]
-    """One motion per iteration of every cascade, each from the source as given onto the target."""
+    """One motion per iteration, cascade after cascade, each from the source as given onto the
+    target."""
     weights: Float[Array, " n"]
     """How much of each source point found a partner in the last match, in [0, 1]."""
     covered: Float[Array, " m"]
@@ -34,14 +35,14 @@ class Registration:
     targets: Float[Array, "n 3"]
     """Where the last match puts each source point."""
     beta: Float[Array, " L"]
-    """Annealing: how sharp the match of each iteration was."""
+    """Annealing: how sharp the match of each of these iterations was."""
     alpha: Float[Array, " L"]
     """Annealing: how far in feature space it reached."""
     clues: confidence.NetworkClues
     """What the confidence was estimated from."""
     confidence: Float[Array, ""]
     """Estimated probability, in [0, 1], that `transform` is right to 5 degrees and 0.1; for clouds
-    of unit size and the weights that ship."""
+    of unit size, one cascade and the weights that ship."""
 
     @property
     def transform(self) -> Float[Array, "*batch 4 4"]:
@@ -102,6 +103,7 @@ def _register(params, source, target, *, iterations, cascades, settings):
         target = _encode(params, target, settings=settings)
 
     def cascade(start, _):
+        start = lax.stop_gradient(start) if settings.detach_motion else start
         moved = moved_on(start, source, settings)
         steps = list(iterate(params, moved, target, iterations, settings))
         transforms = jnp.stack([rigid.compose(step.transform, start) for step in steps])
@@ -116,7 +118,7 @@ def _register(params, source, target, *, iterations, cascades, settings):
         return transforms[-1], found
 
     # a loop, since it is compiled once however many there are
-    start = jnp.eye(4, dtype=source.points.dtype)
+    start = jnp.eye(4, dtype=jnp.result_type(source.points, target.cloud.points))
     found = lax.scan(cascade, start, length=cascades)[1]
     of_all = {name: jnp.concatenate(found[name]) for name in ("transforms", "beta", "alpha")}
     of_last = {name: found[name][-1] for name in ("weights", "covered", "targets")}

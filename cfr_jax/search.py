@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 
 from cfr_jax import planning, preparation, programs, quality, refinement, rigid
 from cfr_jax.io import PointCloud
-from cfr_jax.registration import Settings, encode, prepare, register
+from cfr_jax.prepared import Settings, moved_by, prepare
+from cfr_jax.registration import encode, register
 from cfr_jax.rotations import cover
 from cfr_jax.solving import on_device, surface, timed
 
@@ -85,7 +86,7 @@ def propose(
     surfaces = surface(source), surface(target)
 
     def end(start):
-        found = register(params, _moved(source, start), encoded, settings=COARSE)
+        found = register(params, moved_by(start, source), encoded, settings=COARSE)
         motion = rigid.compose(found.transform, start)
         return motion, quality.mutual_fit(*surfaces, motion, _COARSE_REACH)
 
@@ -165,9 +166,3 @@ def _distinct(motions, fits, kept):
         return jnp.where(near, -1, fits), (motions[best], fits[best])
 
     return Candidates(*lax.scan(take, fits, length=kept)[1])
-
-
-def _moved(cloud, motion):
-    return cloud.replace(
-        points=rigid.apply(motion, cloud.points), normals=rigid.rotate(motion, cloud.normals)
-    )

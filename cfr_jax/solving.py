@@ -17,10 +17,12 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from cfr_jax import confidence, programs, quality, refinement
+from cfr_jax.iterations import Encoded
 from cfr_jax.planning import CASCADES, SETTINGS
 from cfr_jax.preparation import UnitCloud
+from cfr_jax.prepared import Cloud, prepare
 from cfr_jax.refinement import Surface
-from cfr_jax.registration import Cloud, Encoded, Registration, encode, prepare, register
+from cfr_jax.registration import Registration, encode, register
 
 DISTANCE = refinement.CUT
 
@@ -112,7 +114,7 @@ def surface(cloud: Cloud) -> Surface:
 
 
 def on_device(unit: UnitCloud) -> dict[str, jax.Array]:
-    """The arguments of `registration.prepare` for a unit cloud."""
+    """The arguments of `prepared.prepare` for a unit cloud."""
     points = unit.points if unit.normals is None else np.hstack([unit.points, unit.normals])
     # not jnp.asarray, which compiles a copy of each shape
     return jax.device_put({"points": points, "neighbors": unit.neighbors, "mask": unit.mask})

@@ -12,7 +12,7 @@ from pathlib import Path
 from ml_collections import ConfigDict
 
 STEPS = 1000
-# What a variant does otherwise: `registration.Settings`, or one light layer for all iterations.
+# What a variant does otherwise: `prepared.Settings`, or one light layer for all iterations.
 VARIANTS = {
     "cfr": {},
     "shared": {"shared": True},
@@ -33,4 +33,6 @@ def get_config(chosen: str = "cfr") -> ConfigDict:
     config.settings = ConfigDict(changes.get("settings", {}))
     config.phases = ({"steps": int(steps or STEPS), "points": 256, "neighbors": 24, "batch": 8},)
     config.validation_pairs = 93
+    # turned as the protocol has it and about the shape's middle, as the recipe was when these ran
+    config.sampling.update(both_ways=0.0, near=0.0, centered=0.0)
     return config

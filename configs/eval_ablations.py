@@ -1,5 +1,7 @@
 """The paper's ablations, one each: --config=configs/eval_ablations.py:weights
 
+Of trainings of another length it is --config=configs/eval_ablations.py:weights,3000.
+
 As `eval_open_cad.py`, with the variants of one ablation as methods. Where a variant needs weights
 of its own, they are those that `ablate.py` trains in `config.runs`, by `ablations.py`.
 """
@@ -31,17 +33,23 @@ ABLATIONS = {
 }
 
 
-def get_config(ablation: str = "weights") -> ConfigDict:
+def get_config(chosen: str = "weights") -> ConfigDict:
     """Everything that `evaluate.py` reads, and `trainings`, which `ablate.py` reads."""
     # a config is a file and no module: it is found beside this one
     beside = Path(__file__).with_name("eval_open_cad.py")
     config = runpy.run_path(str(beside))["get_config"]()
+    ablation, _, steps = chosen.partition(",")
+    variants = ABLATIONS[ablation]
+    # where the weights of the trainings are
+    config.runs = f"runs/ablations_{steps}" if steps else "runs/ablations"
+    config.trainings = tuple(dict.fromkeys(run for run, _ in variants.values() if run))
     config.title = f"Ablation: {ablation}"
-    config.runs = "runs/ablations"  # where the weights of the trainings are
-    chosen = ABLATIONS[ablation]
-    config.trainings = tuple(dict.fromkeys(run for run, _ in chosen.values() if run))
+    if config.trainings:
+        short = Path(__file__).with_name("ablations.py")
+        steps = steps or runpy.run_path(str(short))["STEPS"]
+        config.title += f" (after short trainings of {int(steps):,} steps)"
     config.methods = ConfigDict()
-    for name, (run, settings) in chosen.items():
+    for name, (run, settings) in variants.items():
         entry = {"use": "cfr", "batch": 8, "modules": True}
         entry["options"] = {"refine": False, "settings": settings}
         entry["estimated_normals"] = name.startswith("estimated")

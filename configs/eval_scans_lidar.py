@@ -14,6 +14,7 @@ def get_config() -> ConfigDict:
     config.data.distance = 10.0  # between the frames of a pair
     config.data.stride = 2  # frames from pair to pair; 0: the next pair starts after the last, as
     # published, which leaves few pairs of a short sequence
+    config.data.frames = ()  # first and stop: pairs of these frames alone, as `scans.test_frames`
     config.data.points = 4000
     config.data.angle = 45.0  # degrees, per Euler angle
     config.data.translation = 15.0
@@ -56,7 +57,7 @@ def methods() -> dict:
             "threads": 1,
         },
         "ransac": {"use": "ransac", "options": features | {"distance": 0.6}, "threads": 1},
-        "kiss_matcher": {"use": "kiss_matcher", "options": {"voxel": 1.0}},
+        "kiss_matcher": {"use": "kiss_matcher", "options": {"voxel": 1.0}, "threads": 1},
         "cfr": {"use": "cfr", "options": network | {"refine": False}},
         "cfr_refined": {"use": "cfr", "options": network | {"refine": True}},
         "cfr_estimated": {
@@ -70,7 +71,6 @@ def methods() -> dict:
             "options": prepared | {"refine": False, "settings": {"optimized": False}},
         },
         "rpmnet_optim": {"use": "rpmnet", "options": prepared | {"refine": False}},
-        "rpmnet_optim_refined": {"use": "rpmnet", "options": prepared | {"refine": True}},
         "rpmnet_optim_estimated": {
             "use": "rpmnet",
             "options": prepared | {"refine": False},

@@ -10,6 +10,7 @@ def get_config() -> ConfigDict:
     config.data = ConfigDict()
     config.data.kind = "pairs"
     config.data.path = "../shared/data/scans/rgbd/pairs.h5"  # or a list: source,target,16 numbers
+    config.data.frames = ()  # first and stop: pairs of these frames alone, as `scans.test_frames`
     config.limit = 0
     config.seed = 0
     config.weights = "object"
@@ -53,7 +54,7 @@ def methods() -> dict:
             "threads": 1,
         },
         "ransac": {"use": "ransac", "options": features | {"distance": 0.075}, "threads": 1},
-        "kiss_matcher": {"use": "kiss_matcher", "options": {"voxel": 0.05}},
+        "kiss_matcher": {"use": "kiss_matcher", "options": {"voxel": 0.05}, "threads": 1},
         "cfr": {"use": "cfr", "options": network | {"refine": False}},
         "cfr_refined": {"use": "cfr", "options": network | {"refine": True}},
         # prepared as `align` prepares clouds for our network
@@ -62,5 +63,4 @@ def methods() -> dict:
             "options": prepared | {"refine": False, "settings": {"optimized": False}},
         },
         "rpmnet_optim": {"use": "rpmnet", "options": prepared | {"refine": False}},
-        "rpmnet_optim_refined": {"use": "rpmnet", "options": prepared | {"refine": True}},
     }

@@ -1,4 +1,4 @@
-"""The weights `object`: data and loss of `open_cad.py`, some seven hours on two cores.
+"""A long training on the open CAD corpus: as `open_cad.py`, some seven hours on two cores.
 
 A restart costs nothing but the steps since the last checkpoint, so the run may be made in pieces.
 """
@@ -14,16 +14,13 @@ def get_config() -> ConfigDict:
     # a config is a file and no module: it is found beside this one
     beside = Path(__file__).with_name("open_cad.py")
     config = runpy.run_path(str(beside))["get_config"]()
-    # Neighborhoods cover the same patch of the shape in every phase, that of the test: a patch that
-    # changed half way cost a degree (docs/training.md).
+    # Neighborhoods cover the same patch of the shape in every phase, that of the test (why:
+    # docs/training.md, "Neighborhoods").
     config.phases = (
         {"steps": 10000, "points": 256, "neighbors": 24, "batch": 8},
         {"steps": 10000, "points": 358, "neighbors": 32, "batch": 8},
         {"steps": 8000, "points": 717, "neighbors": 64, "batch": 8},
     )
-    config.sampling.both_ways = 0.5
-    config.sampling.near = 0.3
-    config.sampling.centered = 0.4
     config.train.optimizer = "muon"
     config.train.schedule = "wsd"
     config.train.warmup = 0.02

@@ -10,7 +10,7 @@ def get_config() -> ConfigDict:
     config.network = "cfr"
     config.iterations = 5
     config.shared = False  # one light layer for all iterations, instead of one each
-    config.settings = ConfigDict()  # fields of `registration.Settings` other than the paper's
+    config.settings = ConfigDict()  # fields of `prepared.Settings` other than the paper's
 
     config.data = ConfigDict()
     # any file in the ModelNet40 layout, or sources by name, as in scans.py
@@ -28,11 +28,9 @@ def get_config() -> ConfigDict:
     config.sampling.keep = (0.55, 0.85)  # share left by each crop; the test protocol has 0.7
     config.sampling.angle = 45.0  # degrees, per Euler angle
     config.sampling.translation = 0.5
-    config.sampling.both_ways = 0.0  # of the pairs: each angle from [-angle, angle], not [0, angle]
-    config.sampling.near = 0.0  # of the pairs: smaller motions, as a second cascade sees them
-    config.sampling.centered = (
-        0.0  # of the pairs: each cloud about its own centroid, as for `align`
-    )
+    config.sampling.both_ways = 0.5  # of the pairs: each angle from [-angle, angle], not [0, angle]
+    config.sampling.near = 0.3  # of the pairs: smaller motions, as a second cascade sees them
+    config.sampling.centered = 0.4  # of the pairs: clouds about their own centroids, as `align` has
     config.sampling.any_orientation = 0.3  # of the shapes; the rest stand upright, as CAD models do
     config.sampling.scale = (0.8, 1.2)
     config.sampling.uneven = 0.0  # of the pairs: clouds denser on one side, `density` times

@@ -29,6 +29,7 @@ def get_config() -> ConfigDict:
         "pairs": {"kind": "pairs", "path": "", "repeat": 0},
     }
     config.sampling.keep = (0.5, 0.9)
+    config.sampling.both_ways = 1.0
     config.sampling.estimated_normals = 0.7  # of those that have normals; the rest always
     config.sampling.noise = (0.0, 0.01)
     config.sampling.outliers = (0.0, 0.03)

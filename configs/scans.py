@@ -35,6 +35,7 @@ def get_config() -> ConfigDict:
 
     config.sampling.keep = (0.7, 1.0)  # scans overlap in part as they are
     config.sampling.translation = 0.15  # each cloud lies about its own centroid
+    config.sampling.both_ways = 1.0
     config.sampling.any_orientation = 0.5
     config.sampling.scale = (0.85, 1.15)
     config.sampling.noise = (0.0, 0.005)  # they have their own

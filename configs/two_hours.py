@@ -27,4 +27,6 @@ def get_config(network: str = "cfr") -> ConfigDict:
         for phase, steps in zip(config.phases, _STEPS[network], strict=True)
     )
     config.validation_pairs = 155
+    # turned as the protocol has it and about the shape's middle, as the recipe was when these ran
+    config.sampling.update(both_ways=0.0, near=0.0, centered=0.0)
     return config

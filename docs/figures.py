@@ -106,7 +106,9 @@ def draw_iterations(path: Path, source, target, found, truth) -> None:
     start = np.eye(4)  # where `align` begins: one centroid on the other
     start[:3, 3] = target.points.mean(axis=0) - source.points.mean(axis=0)
     stations = [("start", start)]
-    stations += [(f"iteration {i + 1}", step) for i, step in enumerate(found.transforms)]
+    last = len(found.transforms) - 1
+    shown = [*range(len(found.transforms) // 2), last]  # of the second cascade only where it ended
+    stations += [(f"iteration {i + 1}", found.transforms[i]) for i in shown]
     stations.append(("refined" if found.refined else "answer", found.transform))
     figure = Figure(figsize=(10.2, 2.0), facecolor="white")
     middle = target.points.mean(axis=0)

@@ -129,6 +129,20 @@ def test_reproduce_says_whether_the_published_score_holds(
     assert capsys.readouterr().out.strip().endswith(verdict)
 
 
+def test_reproduce_writes_its_scores_alone_to_stdout_if_asked_to(monkeypatch, capsys, tmp_path):
+    expected = CARD["reproduce"]["expected"]
+    monkeypatch.setattr(reproduction, "measure", lambda params, told: expected)
+    monkeypatch.setenv("CFR_JAX_CACHE", "off")
+    monkeypatch.chdir(tmp_path)
+
+    assert main(["reproduce", "object", "--json", "-"]) == 0
+
+    told = capsys.readouterr()
+    schema("reproduce").validate(json.loads(told.out))
+    assert told.err.strip().endswith("the published score holds")
+    assert not list(tmp_path.iterdir())
+
+
 def test_scores_are_measured_against_the_truth(monkeypatch):
     # given answers that are right, but for one pair that has none
     cloud = PointCloud(np.eye(3))

@@ -177,4 +177,6 @@ def test_every_source_has_a_credit():
         "flightgear-data-ai",
         "sweethome3d-furniture",
     ]
-    assert all(source.credit in open_cad.credits_text() for source in SOURCES)
+    text = open_cad.credits_text({source.package: f"{source.version}.7" for source in SOURCES})
+    assert all(source.credit in text for source in SOURCES)
+    assert all(f"`{source.package}` {source.version}.7)" in text for source in SOURCES)

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -263,6 +264,42 @@ def test_data_that_cannot_be_used_is_told(tmp_path, change, limit, message):
     data = {"kind": "corpus", "path": str(a_corpus(tmp_path / "t.h5")), "protocol": "partial"}
     with pytest.raises(ValueError, match=message):
         read_pairs(ConfigDict(data | change), limit, tmp_path)
+
+
+def test_pairs_of_some_frames_are_those_whose_both_frames_are_among_them(tmp_path):
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    with h5py.File(tmp_path / "pairs.h5", "w") as file:
+        for name, frames in (("a", (0, 3)), ("b", (3, 5)), ("c", (5, 9)), ("d", None)):
+            group = file.create_group(name)
+            group["source"], group["target"], group["transform"] = points, points, np.eye(4)
+            if frames is not None:
+                group.attrs["source_frame"], group.attrs["target_frame"] = frames
+    data = ConfigDict({"kind": "pairs", "path": str(tmp_path / "pairs.h5"), "frames": (3, 9)})
+
+    assert [pair.name for pair in read_pairs(data, 0, tmp_path)] == ["b"]
+    data.frames = ()
+    assert len(read_pairs(data, 0, tmp_path)) == 4
+
+
+def test_the_code_of_a_network_is_told_apart_by_every_file_that_makes_its_answers():
+    """All that `evaluation.network` imports of the package, and what those import."""
+    from cfr_jax.evaluation import methods
+
+    loaded = subprocess.run(
+        [sys.executable, "-c", "import sys, cfr_jax.evaluation.network; print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
+    package = Path(methods.__file__).parents[1]
+    told = {path for pattern in methods._OURS for path in package.glob(pattern)}
+    # what reads, checks and compares, but computes no answer
+    apart = ("cfr_jax.io.", "cfr_jax.data.", "cfr_jax.evaluation.", "cfr_jax.batch.")
+    for name in loaded:
+        if name.startswith("cfr_jax.") and not name.startswith(apart):
+            path = package.joinpath(*name.split(".")[1:])
+            path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+            assert path in told, name
 
 
 def test_a_pair_without_truth_cannot_be_measured(tmp_path):

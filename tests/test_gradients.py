@@ -1,5 +1,7 @@
 """Gradients of `register`: finite for any finite clouds, and right for ordinary ones."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,8 @@ import pytest
 from oracle import clouds
 
 from cfr_jax.neighbors import nearest_on_host
-from cfr_jax.registration import Settings, prepare, register
+from cfr_jax.prepared import Settings, moved_by, prepare
+from cfr_jax.registration import register
 
 N, M, K = 24, 28, 6
 SMALL = Settings(neighbors=K)
@@ -24,8 +27,8 @@ CLOUDS = {
 }
 
 
-def total(params, source, target):
-    found = register(params, source, target, iterations=2, settings=SMALL)
+def total(params, source, target, cascades=1):
+    found = register(params, source, target, iterations=2, cascades=cascades, settings=SMALL)
     pull = jnp.cos(jnp.arange(16, dtype=found.transform.dtype)).reshape(4, 4)
     return jnp.sum(found.transforms * pull) + jnp.sum(found.weights**2) + jnp.sum(found.covered**2)
 
@@ -84,8 +87,9 @@ def test_gradients_are_finite_and_zero_in_the_padding(params):
     assert gradients[1][:20].any() and not gradients[1][20:].any()
 
 
+@pytest.mark.parametrize("cascades", [1, 2])
 @pytest.mark.parametrize("of", ["params", "source", "target"])
-def test_gradients_are_their_finite_differences(x64, params, of):
+def test_gradients_are_their_finite_differences(x64, params, of, cascades):
     # the neighbors are held: which they are does not differentiate
     pair = clouds.random_pair(1, N, M)
     rng = np.random.default_rng(2)
@@ -98,7 +102,7 @@ def test_gradients_are_their_finite_differences(x64, params, of):
     which = ("params", "source", "target").index(of)
     towards = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), at[which])
 
-    value, gradients = in_double(*at, *held)
+    value, gradients = in_double(*at, *held, cascades)
 
     derivative = sum(
         jax.tree.leaves(jax.tree.map(lambda g, t: jnp.sum(g * t), gradients[which], towards))
@@ -108,20 +112,42 @@ def test_gradients_are_their_finite_differences(x64, params, of):
     for sign in (1, -1):
         moved = list(at)
         moved[which] = jax.tree.map(lambda a, t, s=sign: a + s * step * t, at[which], towards)
-        sides.append(in_double(*moved, *held)[0])
+        sides.append(in_double(*moved, *held, cascades)[0])
     np.testing.assert_allclose(derivative, (sides[0] - sides[1]) / (2 * step), rtol=1e-5)
 
 
-@jax.jit
-def in_double(params, source, target, source_neighbors, target_neighbors):
+@functools.partial(jax.jit, static_argnums=5)
+def in_double(params, source, target, source_neighbors, target_neighbors, cascades):
     def of(params, source, target):
         return total(
             params,
             prepare(source, neighbors=source_neighbors),
             prepare(target, neighbors=target_neighbors),
+            cascades,
         )
 
     return jax.value_and_grad(of, (0, 1, 2))(params, source, target)
+
+
+def test_detached_motion_stops_gradients_between_cascades(params):
+    # then the gradient of a second cascade is that of a registration from where the first ended
+    source, target = (cloud("random", seed, N, True) for seed in (0, 1))
+    settings = Settings(neighbors=K, detach_motion=True)
+    source, target = (prepare(points, settings=settings) for points in (source, target))
+    first = register(params, source, target, iterations=1, settings=settings).transform
+
+    def twice(params):
+        found = register(params, source, target, iterations=1, cascades=2, settings=settings)
+        return jnp.sum(found.transform[0])
+
+    def again(params):
+        moved = moved_by(first, source)
+        found = register(params, moved, target, iterations=1, settings=settings)
+        return jnp.sum((found.transform @ first)[0])
+
+    found, wanted = (jax.jit(jax.grad(of))(params) for of in (twice, again))
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
 
 
 def test_detached_motion_stops_gradients_between_iterations(params):

@@ -15,9 +15,11 @@ import numpy as np
 from cfr_jax import programs, solving
 from cfr_jax.alignment import Alignment, answer
 from cfr_jax.batch.memo import Memo
+from cfr_jax.iterations import Encoded
 from cfr_jax.planning import SETTINGS, Plan
 from cfr_jax.preparation import UnitCloud
-from cfr_jax.registration import Encoded, encode, prepare
+from cfr_jax.prepared import prepare
+from cfr_jax.registration import encode
 
 _KEPT = 32  # encoded targets, about 2 MB each
 

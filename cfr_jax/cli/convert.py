@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
     from cfr_jax import __version__
     from cfr_jax.convert import convert
-    from cfr_jax.registration import iterations_of
+    from cfr_jax.iterations import iterations_of
     from cfr_jax.weights import NETWORKS, network_of, read_weights, save_params
 
     params = convert(args.checkpoint)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +33,14 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.set_defaults(run=run)
     parser.add_argument("name", metavar="NAME", help="weights by name, as `cfr models` lists them")
-    parser.add_argument("--json", metavar="FILE", type=Path, help="the scores, as JSON")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="the scores, as JSON (-: stdout)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Measures, and holds the scores against those of the card."""
-    if args.json is not None:
+    to_stdout = args.json == Path("-")
+    told = sys.stderr if to_stdout else sys.stdout
+    if args.json is not None and not to_stdout:
         outputs.check_output("--json", args.json)
 
     from cfr_jax import cards
@@ -52,13 +55,14 @@ def run(args: argparse.Namespace) -> int:
 
     keep_compiled_programs()
     published: dict[str, Any] = card["reproduce"]
-    print(f"{args.name} on {published['on']}")
+    print(f"{args.name} on {published['on']}", file=told)
     with Progress(total=reproduction.PAIRS, desc="registering", unit=" pairs") as bar:
         scores = reproduction.measure(load_params(args.name), bar.update)
     missed = reproduction.missed(scores, published["expected"], published["tolerance"])
     for stage, measured in scores.items():
-        print(f"{stage}, measured   {models.scores_in_words(measured)}")
-        print(f"{stage}, published  {models.scores_in_words(published['expected'][stage])}")
+        expected = models.scores_in_words(published["expected"][stage])
+        print(f"{stage}, measured   {models.scores_in_words(measured)}", file=told)
+        print(f"{stage}, published  {expected}", file=told)
     if args.json is not None:
         document = {
             "format": FORMAT,
@@ -72,9 +76,13 @@ def run(args: argparse.Namespace) -> int:
             "holds": not missed,
             "missed": missed,
         }
-        write_atomically(args.json, (json.dumps(document, indent=2) + "\n").encode())
-        print(f"wrote       {args.json}")
+        text = json.dumps(document, indent=2) + "\n"
+        if to_stdout:
+            sys.stdout.write(text)
+        else:
+            write_atomically(args.json, text.encode())
+            print(f"wrote       {args.json}")
     for text in missed:
-        print(f"missed      {text}")
-    print("the published score does not hold" if missed else "the published score holds")
+        print(f"missed      {text}", file=told)
+    print(f"the published score {'does not hold' if missed else 'holds'}", file=told)
     return MISSED if missed else 0

@@ -12,7 +12,7 @@ import os
 import re
 import shutil
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache, partial
@@ -22,7 +22,7 @@ from pathlib import Path
 from cfr_jax.data.build import Item, Report, build
 from cfr_jax.data.furniture import FurnitureLibrary
 from cfr_jax.data.meshes import parse_pmd, read_mesh
-from cfr_jax.data.packages import download, extract, find_deb
+from cfr_jax.data.packages import download, extract, find_deb, version_of
 from cfr_jax.io.mesh import Mesh
 
 UNSEEN = (
@@ -83,8 +83,15 @@ def build_open_cad(out: Path, debs: Path | None = None, quiet: bool = False) -> 
     out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         items: list[Item] = []
+        versions = {}
         for source in SOURCES:
-            paths = unpack(source, work, debs, quiet)
+            paths, version = unpack(source, work, debs, quiet)
+            versions[source.package] = version
+            if version != source.version:
+                print(
+                    f"{source.package}: version {version}; the corpus was made of "
+                    f"{source.version}, and shapes may differ"
+                )
             items += source_items(source.package, paths, stack)
         if not items:
             raise ValueError("the packages hold no mesh of a category")
@@ -96,22 +103,28 @@ def build_open_cad(out: Path, debs: Path | None = None, quiet: bool = False) -> 
     (out / "left_out.tsv").write_text(
         "".join(f"{name}\t{why}\n" for name, why in sorted(report.left_out.items()))
     )
-    (out / "CREDITS.md").write_text(credits_text())
+    (out / "CREDITS.md").write_text(credits_text(versions))
     shutil.rmtree(work, ignore_errors=True)
     return report
 
 
-def credits_text() -> str:
-    """What has to stay with the corpus."""
-    lines = [f"- {s.credit} (Debian package `{s.package}` {s.version})\n" for s in SOURCES]
-    return "# Credits\n\nThe point clouds are sampled from meshes of\n\n" + "".join(lines)
+def credits_text(versions: Mapping[str, str]) -> str:
+    """What has to stay with the corpus, made of packages of these versions."""
+    lines = (f"- {s.credit} (Debian package `{s.package}` {versions[s.package]})" for s in SOURCES)
+    return "\n".join(
+        ["# Credits", "", "The point clouds are sampled from meshes of", "", *lines, ""]
+    )
 
 
-def unpack(source: Source, work: Path, debs: Path | None, quiet: bool = False) -> list[Path]:
-    """The package's mesh files, unpacked into `work` (once: a second call finds them there)."""
+def unpack(
+    source: Source, work: Path, debs: Path | None, quiet: bool = False
+) -> tuple[list[Path], str]:
+    """The package's mesh files, unpacked into `work` (once: a second call finds them there), and
+    its version."""
     done = work / f"{source.package}.json"
     if done.is_file():
-        return [work / inside for inside in json.loads(done.read_text())]
+        found = json.loads(done.read_text())
+        return [work / inside for inside in found["files"]], found["version"]
     if debs is None:
         deb = download(source.package, work)
     elif (found := find_deb(source.package, debs)) is not None:
@@ -124,11 +137,13 @@ def unpack(source: Source, work: Path, debs: Path | None, quiet: bool = False) -
     if not paths:
         raise ValueError(f"{deb} holds no file like {source.files}: is it another version?")
     part = done.with_suffix(".part")
-    part.write_text(json.dumps([path.relative_to(work).as_posix() for path in paths]))
+    version = version_of(deb)
+    files = [path.relative_to(work).as_posix() for path in paths]
+    part.write_text(json.dumps({"version": version, "files": files}))
     os.replace(part, done)
     if debs is None:
         deb.unlink()
-    return paths
+    return paths, version
 
 
 def source_items(package: str, paths: list[Path], stack: ExitStack) -> Iterator[Item]:

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO
+from urllib.parse import unquote
 
 from cfr_jax.progress import Progress
 
@@ -50,6 +51,11 @@ def download(package: str, folder: Path) -> Path:
     os.replace(fetched, kept)
     beside.rmdir()
     return kept
+
+
+def version_of(deb: Path) -> str:
+    """As the name of the file tells it, where a colon is written %3a."""
+    return unquote(deb.name.split("_")[1])
 
 
 def find_deb(package: str, folder: Path) -> Path | None:

@@ -185,13 +185,17 @@ def _make_pair(
     rng = reseed()
     motion = random_motion(protocol.angle, protocol.translation, rng, both_ways=protocol.both_ways)
     rotation = motion[:3, :3]
-    moved, moved_normals = points @ rotation.T + motion[:3, 3], normals @ rotation.T
+    # the cropped rows are moved, as published: a product of all rows may round its last bit apart
+    source = points[source_rows] @ rotation.T + motion[:3, 3]
+    source_normals = normals[source_rows] @ rotation.T
+    target, target_normals = points[target_rows], normals[target_rows]
 
     if protocol.keep is not None or protocol.noise:
         rng = reseed()
-        source_rows = source_rows[resample(len(source_rows), count, rng)]
-        target_rows = target_rows[resample(len(target_rows), count, rng)]
-    source, target = moved[source_rows], points[target_rows]
+        chosen = resample(len(source), count, rng)
+        source, source_normals = source[chosen], source_normals[chosen]
+        chosen = resample(len(target), count, rng)
+        target, target_normals = target[chosen], target_normals[chosen]
     if protocol.noise:
         source, target = jitter(source, rng), jitter(target, rng)
     target_order = rng.permutation(len(target))
@@ -201,10 +205,10 @@ def _make_pair(
         name=name,
         source=source[source_order],
         target=target[target_order],
-        source_normals=moved_normals[source_rows][source_order],
-        target_normals=normals[target_rows][target_order],
+        source_normals=source_normals[source_order],
+        target_normals=target_normals[target_order],
         transform=way_back(motion),
         overlap=overlap,
-        clean_source=moved,
+        clean_source=points @ rotation.T + motion[:3, 3],
         clean_target=points,
     )

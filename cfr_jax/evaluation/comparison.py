@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -104,9 +103,7 @@ def _about(config: Any, count: int, command: str) -> dict[str, Any]:
         "limits": list(config.limits),
         "timeout": config.timeout,
         "command": command,
-        "commit": machine.commit(),
-        "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        "machine": machine.describe(),
+        **machine.stamp(),
         "versions": machine.versions(),
     }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from cfr_jax.data import kitti, protocol
 from cfr_jax.data.corpus import Corpus, read_corpus
 from cfr_jax.data.layout import recognize
 from cfr_jax.data.modelnet import read_modelnet40
-from cfr_jax.data.pairs import Pair, open_pairs
+from cfr_jax.data.pairs import Hdf5Pairs, Pair, open_pairs
 
 _PROTOCOLS = {
     made.name: made
@@ -110,7 +111,13 @@ def _kitti(data: Any, cache: Path) -> tuple[int, Make]:
         )
         for sequence in data.sequences
     ]
-    places = [(part, index) for part in parts for index in range(len(part))]
+    first, stop = data.get("frames") or (0, math.inf)
+    places = [
+        (part, index)
+        for part in parts
+        for index, frames in enumerate(part.frames.tolist())
+        if all(first <= frame < stop for frame in frames)
+    ]
 
     def make(index: int) -> Pair:
         part, row = places[index]
@@ -121,7 +128,18 @@ def _kitti(data: Any, cache: Path) -> tuple[int, Make]:
 
 def _pairs(data: Any, cache: Path) -> tuple[int, Make]:
     held: Sequence[Pair] = open_pairs(data.path)
-    return len(held), held.__getitem__
+    if not data.get("frames"):
+        return len(held), held.__getitem__
+    if not isinstance(held, Hdf5Pairs):
+        raise ValueError(f"data.frames: {data.path} does not say from which frames its pairs are")
+    first, stop = data.frames
+    # names instead of numbers, where a group does not tell its frames, are in no range
+    rows = [
+        row
+        for row in range(len(held))
+        if all(isinstance(frame, int) and first <= frame < stop for frame in held.frames(row))
+    ]
+    return len(rows), lambda index: held[rows[index]]
 
 
 def _checked(pair: Pair) -> Pair:

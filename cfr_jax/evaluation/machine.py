@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import importlib.metadata
 import os
 import platform
@@ -30,6 +31,12 @@ def commit() -> str:
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     return told[0] + ("+" if told[1] else "")
+
+
+def stamp() -> dict[str, str]:
+    """What tells when, where and with which code something was measured."""
+    date = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return {"commit": commit(), "date": date, "machine": describe()}
 
 
 def versions() -> dict[str, str]:

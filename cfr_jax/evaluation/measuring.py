@@ -16,6 +16,9 @@ from cfr_jax.evaluation.datasets import nearest_motion
 from cfr_jax.evaluation.records import Records
 from cfr_jax.metrics import Statistic
 
+# Root mean square and mean absolute differences of Euler angles and of coordinates.
+_BY_AXIS = ("r_mae", "r_rmse", "t_mae", "t_rmse")
+
 
 @dataclass(frozen=True, eq=False)
 class Measured:
@@ -29,6 +32,8 @@ class Measured:
     """After each iteration the method tells of; the last column is the answer."""
     err_t: Float[np.ndarray, "p i"]
     chamfer: Float[np.ndarray, " p"] | None
+    by_axis: dict[str, Float[np.ndarray, " p"]]
+    """`r_mae`, `r_rmse`, `t_mae` and `t_rmse` of the answer, over the axes of each pair."""
     seconds: Float[np.ndarray, " p"]
     failures: dict[int, str]
     about: dict[str, Any]
@@ -64,12 +69,15 @@ def measure(name: str, records: Records, pairs: Sequence[Pair]) -> Measured:
     iterations = max((len(answer) for answer in answers.values()), default=1)
     err_r, err_t = np.full((2, len(pairs), iterations), np.nan)
     chamfer, seconds = np.full((2, len(pairs)), np.nan)
+    by_axis = {name: np.full(len(pairs), np.nan) for name in _BY_AXIS}
     for index, estimates in answers.items():
         pair, told = pairs[index], records.by_pair[index].seconds
         truths = np.broadcast_to(pair.transform, estimates.shape)
         err_r[index] = metrics.err_r(estimates, truths)
         err_t[index] = metrics.err_t(estimates, truths)
         seconds[index] = np.nan if told is None else told
+        for name, errors in by_axis.items():
+            errors[index] = getattr(metrics, name)(estimates[-1:], truths[-1:])[0]
         if pair.clean_source is not None and pair.clean_target is not None:
             chamfer[index] = metrics.chamfer(
                 estimates[-1], pair.source, pair.target, pair.clean_source, pair.clean_target
@@ -80,6 +88,7 @@ def measure(name: str, records: Records, pairs: Sequence[Pair]) -> Measured:
         err_r=err_r,
         err_t=err_t,
         chamfer=chamfer if whole else None,
+        by_axis=by_axis,
         seconds=seconds,
         failures={k: r.failure for k, r in records.by_pair.items() if r.failure is not None},
         about=records.made_with,
@@ -96,6 +105,7 @@ def only(measured: Measured, rows: Int[np.ndarray, " k"]) -> Measured:
         err_r=measured.err_r[rows],
         err_t=measured.err_t[rows],
         chamfer=None if measured.chamfer is None else measured.chamfer[rows],
+        by_axis={name: errors[rows] for name, errors in measured.by_axis.items()},
         seconds=measured.seconds[rows],
         failures={places[k]: why for k, why in measured.failures.items() if k in places},
     )
@@ -104,7 +114,7 @@ def only(measured: Measured, rows: Int[np.ndarray, " k"]) -> Measured:
 def summarize(
     measured: Measured, thresholds: Sequence[tuple[float, float]], seed: int
 ) -> dict[str, Statistic | None]:
-    """Mean and median errors over the pairs answered, and recalls over all pairs.
+    """Mean and median errors over the pairs answered, errors by axis, and recalls over all pairs.
 
     Each with its bootstrap interval; None where nothing was answered or is not measured.
     """
@@ -121,6 +131,10 @@ def summarize(
             numbers[f"{name}_{kind}"] = (
                 metrics.bootstrap(values, statistic, seed=seed) if known else None
             )
+    for name, errors in measured.by_axis.items():
+        statistic = metrics.root_mean_square if name.endswith("rmse") else np.mean
+        values = errors[answered]
+        numbers[name] = metrics.bootstrap(values, statistic, seed=seed) if len(values) else None
     for angle, distance in thresholds:
         hits = measured.recalled(angle, distance).astype(float)
         numbers[recall_name(angle, distance)] = metrics.bootstrap(hits, seed=seed)
@@ -128,5 +142,5 @@ def summarize(
 
 
 def recall_name(angle: float, distance: float) -> str:
-    """As `metrics.summary` calls it."""
+    """Recall within (5, 0.1) is called `recall_5deg_0.1`."""
     return f"recall_{angle:g}deg_{distance:g}"

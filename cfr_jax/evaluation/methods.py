@@ -25,7 +25,15 @@ _FIELDS = {"use", "options", "weights", "threads", "batch", "estimated_normals",
 _DRAWING = {"fgr", "fgr_icp", "ransac"}
 # Files that decide the answers of the peers, and of those methods that are made of our own code.
 _PEERS = ("baselines/*.py", "data/scans.py")
-_OURS = (*_PEERS, "*.py", "sinkhorn/*.py", "evaluation/network.py")
+_OURS = (
+    *_PEERS,
+    "*.py",
+    "extraction/*.py",
+    "io/cloud.py",
+    "sinkhorn/*.py",
+    "evaluation/modules.py",
+    "evaluation/network.py",
+)
 
 
 @dataclasses.dataclass(frozen=True)

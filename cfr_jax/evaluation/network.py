@@ -220,7 +220,7 @@ def _transforms(
         transforms = jnp.stack([rigid.compose(step.transform, start) for step in steps])
         return transforms[-1], transforms
 
-    start = jnp.eye(4, dtype=source.points.dtype)
+    start = jnp.eye(4, dtype=jnp.float32)  # as the clouds of `_stacked` are
     return jax.lax.scan(cascade, start, length=program.cascades)[1].reshape(-1, 4, 4)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from cfr_jax.data.pairs import Pair
-from cfr_jax.evaluation import records
+from cfr_jax.evaluation import machine, records
 from cfr_jax.evaluation.methods import Answer, Method
 from cfr_jax.evaluation.records import Record, Records
 from cfr_jax.evaluation.worker import Failed, Missing, Worker
@@ -55,7 +55,7 @@ def run_method(method: Method, pairs: Sequence[Pair], path: Path, timeout: float
                 bar.write(f"{method.name} is left out: {error}")
                 return held
             if worker.started and held.started is None:
-                held.started = dataclasses.asdict(worker.started)
+                held.started = dataclasses.asdict(worker.started) | machine.stamp()
             bar.update(len(rows))
             if time.monotonic() - saved > _SAVE_EVERY:
                 records.save(path, held)

@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from cfr_jax.atomic import write_atomically
 from cfr_jax.data.pairs import Pair
+from cfr_jax.evaluation.records import code_digest
 
 LIMIT = 2.0
 _TURNS = (180.0, 120.0, 72.0)  # degrees
@@ -37,17 +38,18 @@ _STEPS = 10
 def nearly_symmetric(pairs: Sequence[Pair], cache: Path) -> Bool[np.ndarray, " p"] | None:
     """Which pairs are of such shapes; None where the pairs know no whole shapes.
 
-    The file `cache` keeps what was found, by the points of the shape.
+    The file `cache` keeps what was found, by the points of the shape and the rule.
     """
     if any(pair.clean_target is None for pair in pairs):
         return None
     found = json.loads(cache.read_text()) if cache.exists() else {}
     known = len(found)
+    rule = code_digest("evaluation/symmetry.py").encode()
     keys = []
     for pair in tqdm(pairs, "symmetries", disable=None):
         assert pair.clean_target is not None
         points = np.asarray(pair.clean_target, np.float64)
-        keys.append(hashlib.sha256(points.tobytes()).hexdigest()[:16])
+        keys.append(hashlib.sha256(rule + points.tobytes()).hexdigest()[:16])
         if keys[-1] not in found:
             found[keys[-1]] = asymmetry(points)
     if len(found) > known:

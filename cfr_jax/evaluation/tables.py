@@ -50,13 +50,14 @@ def write_table(
         *_failures(measured),
         "## Time",
         "",
-        f"{about['machine']}; commit {about['commit']}, {about['date']}. Median of the pairs: from "
+        f"{about['machine']}; table of {about['date']}, commit {about['commit']}, answers of the "
+        "commits beside them. Median of the pairs: from "
         "clouds in host memory to the motion in host memory, device-synchronized, neighbors, "
         "normals and features included. Imports, compilation and first-call costs are apart. "
         f"Versions: {', '.join(f'{k} {v}' for k, v in about['versions'].items())}.",
         "",
         *_grid(
-            ["method", "ms / pair", "start-up s", "threads", "device", "pairs a call"],
+            ["method", "ms / pair", "start-up s", "threads", "device", "pairs a call", "commit"],
             [_times(m) for m in measured],
         ),
         "",
@@ -200,6 +201,7 @@ def _times(m: Measured) -> list[str]:
         str(started.get("threads", _NONE)),
         str(started.get("device", _NONE)),
         str(m.about["batch"]),
+        str(started.get("commit", _NONE)),
     ]
 
 

@@ -47,6 +47,7 @@ class Worker:
         self._method = method
         self._process: Any = None
         self._pipe: Any = None
+        self._warm = False
         self.started: Started | None = None
 
     def __enter__(self) -> Worker:
@@ -60,10 +61,12 @@ class Worker:
         allowed = timeout * len(pairs)
         if self._process is None:
             self._start()
+        if not self._warm:
             # the first call is made twice, and the first time nobody knows what else it costs
             allowed += allowed + (START_UP if self.started is None else 3 * self.started.seconds)
         late = f"no answer within {timeout:g} s a pair"
         answers, self.started = self._reply(list(pairs), allowed, late)
+        self._warm = True
         return answers
 
     def _start(self) -> None:
@@ -108,6 +111,7 @@ class Worker:
         self._process.kill()
         self._process.join()
         self._process = self._pipe = None
+        self._warm = False
 
 
 def _serve(pipe: Any, make: Any, threads: int) -> None:
