@@ -76,8 +76,8 @@ def measure(name: str, records: Records, pairs: Sequence[Pair]) -> Measured:
         err_r[index] = metrics.err_r(estimates, truths)
         err_t[index] = metrics.err_t(estimates, truths)
         seconds[index] = np.nan if told is None else told
-        for name, errors in by_axis.items():
-            errors[index] = getattr(metrics, name)(estimates[-1:], truths[-1:])[0]
+        for measure_of, errors in by_axis.items():
+            errors[index] = getattr(metrics, measure_of)(estimates[-1:], truths[-1:])[0]
         if pair.clean_source is not None and pair.clean_target is not None:
             chamfer[index] = metrics.chamfer(
                 estimates[-1], pair.source, pair.target, pair.clean_source, pair.clean_target
