@@ -1,4 +1,4 @@
-"""A long training on the open CAD corpus: as `open_cad.py`, some seven hours on two cores.
+"""A long training on the open CAD corpus: as `open_cad.py`, some six hours on two cores.
 
 A restart costs nothing but the steps since the last checkpoint, so the run may be made in pieces.
 """
@@ -17,8 +17,8 @@ def get_config() -> ConfigDict:
     # Neighborhoods cover the same patch of the shape in every phase, that of the test (why:
     # docs/training.md, "Neighborhoods").
     config.phases = (
-        {"steps": 10000, "points": 256, "neighbors": 24, "batch": 8},
-        {"steps": 10000, "points": 358, "neighbors": 32, "batch": 8},
+        {"steps": 6000, "points": 256, "neighbors": 24, "batch": 8},
+        {"steps": 8000, "points": 358, "neighbors": 32, "batch": 8},
         {"steps": 8000, "points": 717, "neighbors": 64, "batch": 8},
     )
     config.train.optimizer = "muon"
