@@ -59,7 +59,7 @@ def methods() -> dict:
         "ransac": {"use": "ransac", "options": features | {"distance": 0.6}, "threads": 1},
         "kiss_matcher": {"use": "kiss_matcher", "options": {"voxel": 1.0}, "threads": 1},
         "cfr": {"use": "cfr", "options": network | {"refine": False}},
-        "cfr_refined": {"use": "cfr", "options": network | {"refine": True}},
+        "cfr_align": {"use": "cfr", "options": network | {"refine": True}},
         "cfr_estimated": {
             "use": "cfr",
             "options": network | {"refine": False},

@@ -56,7 +56,7 @@ def methods() -> dict:
         "ransac": {"use": "ransac", "options": features | {"distance": 0.075}, "threads": 1},
         "kiss_matcher": {"use": "kiss_matcher", "options": {"voxel": 0.05}, "threads": 1},
         "cfr": {"use": "cfr", "options": network | {"refine": False}},
-        "cfr_refined": {"use": "cfr", "options": network | {"refine": True}},
+        "cfr_align": {"use": "cfr", "options": network | {"refine": True}},
         # prepared as `align` prepares clouds for our network
         "rpmnet": {
             "use": "rpmnet",
