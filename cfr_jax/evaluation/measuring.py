@@ -131,9 +131,9 @@ def summarize(
             numbers[f"{name}_{kind}"] = (
                 metrics.bootstrap(values, statistic, seed=seed) if known else None
             )
-    for name, errors in measured.by_axis.items():
+    for name, each in measured.by_axis.items():
         statistic = metrics.root_mean_square if name.endswith("rmse") else np.mean
-        values = errors[answered]
+        values = each[answered]
         numbers[name] = metrics.bootstrap(values, statistic, seed=seed) if len(values) else None
     for angle, distance in thresholds:
         hits = measured.recalled(angle, distance).astype(float)
