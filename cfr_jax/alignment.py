@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from cfr_jax import confidence, doubts, pyramid, quality, refinement, solving
+from cfr_jax import confidence, doubts, pyramid, quality, refinement, search, solving
 from cfr_jax.baselines import gicp
 from cfr_jax.baselines.optional import require
 from cfr_jax.planning import Plan, planned, read_clouds, rigid_motions
-from cfr_jax.search import Search, search
+from cfr_jax.search import Search
+from cfr_jax.second_look import look_again
 from cfr_jax.weights import load_params
 
 Initial = Float[np.ndarray, "4 4"] | Float[np.ndarray, "k 4 4"] | Literal["global"] | None
@@ -68,7 +69,7 @@ class Alignment:
     initial: Float[np.ndarray, "4 4"] | None = None
     """Where the network started, in the caller's frame: as given, or as a search found it."""
     starts: int = 1
-    """How many starts were tried."""
+    """How many starts were tried, or looked at a second time."""
     alternatives: Float[np.ndarray, "a 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """Other motions that a search found to fit about as well: the shape is nearly symmetric."""
 
@@ -109,6 +110,7 @@ def align(
     | None = None,
     max_points: int | None = None,
     all_points: bool = False,
+    second_look: bool = True,
     seed: int = 0,
 ) -> Alignment:
     """Finds the rigid motion that lays `source` on `target`.
@@ -125,8 +127,10 @@ def align(
     on each other. The network is trained for up to 45 degrees about each axis from there. Several
     (k, 4, 4) are all tried on thinned clouds, and the one from which the clouds come to lie best on
     each other is taken; "global" tries a cover of all rotations (`search`), which takes some
-    times as long, and tells of other motions that fit about as well. The same call gives the same
-    answer, to the bit, on the same machine.
+    times as long, and tells of other motions that fit about as well. Without `initial`, a refined
+    answer that is not to be trusted gets a `second_look`: some starts around the first are tried in
+    the same way, and what is more likely right is kept. The same call gives the same answer, to the
+    bit, on the same machine.
 
     Raises ValueError for clouds without extent or with fewer than 3 points, wrong shapes, values
     that are not finite, and an `initial` that is no rigid motion or leaves the clouds far apart;
@@ -146,15 +150,18 @@ def align(
     seconds = {"compile": 0.0, "run": 0.0}
     thinned = {"max_points": max_points, "seed": seed}
     searched = None
-    if initial is not None:
-        everywhere = isinstance(initial, str) and initial == "global"
-        starts = None if everywhere else rigid_motions(initial)
-        if everywhere or len(starts) > 1:
-            searched = search(params, source, target, starts, **thinned, seconds=seconds)
-            initial = searched.motions[0]
-    plan = planned(source, target, initial=initial, **thinned)
+    everywhere = isinstance(initial, str) and initial == "global"
+    motions = None if initial is None or everywhere else rigid_motions(initial)
+    several = everywhere or (motions is not None and len(motions) > 1)
+    plan = planned(source, target, initial=None if several else initial, **thinned)
+    if several:
+        starts = search.everywhere() if everywhere else search.given(plan.frames, motions)
+        searched = search.search(params, plan, starts, seconds=seconds)
+        plan = plan.started_at(searched.unit_motions[0])
     arguments = params, solving.on_device(plan.source), solving.on_device(plan.target)
     solved = solving.timed(seconds, solving.solve_pair, *arguments, refine=refine is True)
+    if refine is True and second_look and not several:
+        plan, solved, searched = look_again(params, plan, solved, seconds=seconds)
     if refine == "small_gicp":
         solved = _by_small_gicp(plan, arguments[1:], solved, seconds)
     if all_points:
@@ -175,13 +182,14 @@ def answer(
     frames = plan.frames
     transform = frames.to_caller(np.asarray(found.transform))
     initial = None if np.array_equal(frames.initial, np.eye(4)) else frames.initial
-    rivals = np.zeros((0, 4, 4)) if searched is None else searched.rivals(transform)
+    far = None if searched is None or searched.nearby else searched
+    rivals = np.zeros((0, 4, 4)) if far is None else far.rivals(transform)
     resistance = np.asarray(found.quality.resistance)
     determined = bool(resistance.min() >= doubts.FREE)
     weakest = np.asarray(found.quality.weakest)[resistance.argmin()]
     fitness = float(found.quality.fitness)
     clues = {name: float(value) for name, value in confidence.named(found.clues).items()}
-    probability = doubts.bounded(confidence.of_alignment(clues), fitness)
+    probability = doubts.probability(clues, fitness)
     neighbors = min(plan.source.neighbors.shape[1], plan.target.neighbors.shape[1])
     return Alignment(
         transform=transform,
@@ -206,7 +214,7 @@ def answer(
             fitness,
             neighbors,
             frames.size_ratio,
-            searched is not None,
+            far is not None,
         ),
         seconds=seconds,
         initial=initial,

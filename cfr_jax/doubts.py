@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+from cfr_jax import confidence
 from cfr_jax.planning import SETTINGS
 
 # Below this the fit hardly suffers when a cloud slides or turns. Of planes, spheres, cylinders,
@@ -55,10 +56,11 @@ def warnings_of(
     return tuple(warnings)
 
 
-def bounded(probability: float, fitness: float) -> float:
-    """A probability no greater than the fitness where the clouds hardly meet: those it was fitted
-    to did, and it says nothing of others."""
-    return min(probability, fitness) if fitness < _HARDLY else probability
+def probability(clues: Mapping[str, float], fitness: float) -> float:
+    """That the answer is right: no greater than the fitness where the clouds hardly meet. Those it
+    was fitted to did, and it says nothing of others."""
+    fitted = confidence.of_alignment(clues)
+    return min(fitted, fitness) if fitness < _HARDLY else fitted
 
 
 def turns(

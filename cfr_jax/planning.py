@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Integral
@@ -26,6 +27,26 @@ class Plan:
     frames: preparation.Frames
     source: preparation.UnitCloud
     target: preparation.UnitCloud
+    seed: int = 0
+    start_given: bool = False
+    """Whether somebody said where the source starts; else centroid lies on centroid."""
+
+    def started_at(self, motion: Float[np.ndarray, "4 4"]) -> Plan:
+        """The same clouds, the source moved by `motion` of unit clouds first."""
+        rotation, shift = motion[:3, :3], motion[:3, 3]
+        points = np.float32(self.source.points @ rotation.T + shift) * self.source.mask[:, None]
+        normals = self.source.normals
+        moved = dataclasses.replace(
+            self.source,
+            points=points,
+            normals=None if normals is None else np.float32(normals @ rotation.T),
+        )
+        frames = dataclasses.replace(
+            self.frames,
+            source_center=self.frames.target_center,
+            initial=self.frames.to_caller(motion),
+        )
+        return Plan(frames, moved, self.target, self.seed, start_given=True)
 
 
 def read_clouds(source: Any, target: Any) -> tuple[PointCloud, PointCloud]:
@@ -76,7 +97,7 @@ def planned(
             (target, frames.target_center, np.eye(4)),
         )
     )
-    return Plan(frames, *units)
+    return Plan(frames, *units, seed, start_given=initial is not None)
 
 
 def whole(name: str, value: Any, *, least: int) -> int:

@@ -133,6 +133,14 @@ def to_unit(
     return UnitCloud(np.pad(used, pad), normals, np.pad(found, pad), np.arange(size) < count, rows)
 
 
+def thinned(unit: UnitCloud, *, budget: int, neighbors: int, radius: float, seed: int) -> UnitCloud:
+    """At most `budget` points of a unit cloud, where they lie; its `rows` are those of `unit`."""
+    normals = None if unit.normals is None else unit.normals[unit.mask].astype(np.float64)
+    cloud = PointCloud(unit.points[unit.mask].astype(np.float64), normals)
+    options = {"budget": budget, "neighbors": neighbors, "radius": radius, "seed": seed}
+    return to_unit(cloud, np.zeros(3), 1.0, np.eye(4), **options)
+
+
 def subsample(points: Float[np.ndarray, "n 3"], budget: int, seed: int) -> Int[np.ndarray, " m"]:
     """Rows of at most `budget` points, evenly spread: one at random of each voxel of a grid.
 

@@ -8,6 +8,7 @@ of them ended is told by how well the clouds then lie on each other, never by th
 from __future__ import annotations
 
 import functools
+import itertools
 from dataclasses import dataclass
 
 import jax
@@ -18,7 +19,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from cfr_jax import planning, preparation, programs, quality, refinement, rigid
-from cfr_jax.io import PointCloud
 from cfr_jax.prepared import Settings, moved_by, prepare
 from cfr_jax.registration import encode, register
 from cfr_jax.rotations import cover
@@ -39,14 +39,19 @@ _FULL_REACH = refinement.CUT
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What was found, in the caller's frame; motions map source onto target, the best first."""
+    """What was found; motions map source onto target, the best first."""
 
+    unit_motions: Float[np.ndarray, "k 4 4"]
+    """Of the unit clouds of the plan."""
     motions: Float[np.ndarray, "k 4 4"]
+    """Of the caller's clouds."""
     fits: Float[np.ndarray, " k"]
     """`quality.mutual_fit` of each, on the full clouds; never rising."""
     frames: preparation.Frames
     starts: int
     """How many were tried."""
+    nearby: bool = False
+    """Whether only starts around where the source lay were."""
 
     def rivals(self, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "a 4 4"]:
         """Motions that differ from `transform` and fit about as well as the best."""
@@ -106,49 +111,78 @@ def polish(source: dict[str, Array], target: dict[str, Array], motions: Array) -
     return _distinct(*lax.map(refine, motions), len(motions))
 
 
+def everywhere() -> Float[np.ndarray, "s 4 4"]:
+    """Starts of unit clouds that cover all rotations, centroid on centroid."""
+    return _turned(cover(STARTS))
+
+
+def around() -> Float[np.ndarray, "s 4 4"]:
+    """Starts of unit clouds around the one where they lie, for a second look: that one, and turns
+    about six axes by 40 and about the eight between them by 50 degrees."""
+    # imported here: half a second that most answers need not wait for
+    from scipy.spatial.transform import Rotation
+
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    between = np.array(list(itertools.product((1, -1), repeat=3))) / np.sqrt(3)
+    turns = np.concatenate([np.zeros((1, 3)), 40 * axes, 50 * between])
+    return _turned(Rotation.from_rotvec(turns, degrees=True).as_matrix())
+
+
+def given(
+    frames: preparation.Frames, starts: Float[np.ndarray, "s 4 4"]
+) -> Float[np.ndarray, "s 4 4"]:
+    """Starts of the caller's clouds as those of unit clouds. Raises ValueError as `align` does."""
+    unit_starts = frames.to_unit(starts)
+    away = np.abs(unit_starts[:, :3, 3]).max(axis=1)
+    if away.max() > preparation.FARTHEST:
+        raise ValueError(
+            f"initial: number {away.argmax()} leaves the source {away.max():.3g} radii away "
+            f"from the target, wanted at most {preparation.FARTHEST:g}"
+        )
+    return unit_starts
+
+
 def search(
     params: dict,
-    source: PointCloud,
-    target: PointCloud,
-    starts: Float[np.ndarray, "s 4 4"] | None = None,
+    plan: planning.Plan,
+    starts: Float[np.ndarray, "s 4 4"],
     *,
-    max_points: int | None = None,
-    seed: int = 0,
     seconds: dict[str, float],
 ) -> Search:
-    """The best motions of `source` onto `target` from all `starts`, on the host.
+    """The best motions of the plan's source onto its target from all `starts` of unit clouds.
 
-    Starts are motions in the caller's frame; None stands for the cover of all rotations, centroid
-    on centroid. Adds its time to `seconds`, as `solving.timed` does. Raises ValueError as `align`
-    does.
+    Adds its time to `seconds`, as `solving.timed` does.
     """
-    plan = planning.planned(source, target, max_points=max_points, seed=seed)
-    frames = plan.frames
-    if starts is None:
-        unit_starts = np.tile(np.eye(4), (STARTS, 1, 1))
-        unit_starts[:, :3, :3] = cover(STARTS)
-    else:
-        unit_starts = frames.to_unit(starts)
-        away = np.abs(unit_starts[:, :3, 3]).max(axis=1)
-        if away.max() > preparation.FARTHEST:
-            raise ValueError(
-                f"initial: number {away.argmax()} leaves the source {away.max():.3g} radii away "
-                f"from the target, wanted at most {preparation.FARTHEST:g}"
-            )
-    coarse = planning.planned(source, target, max_points=COARSE_POINTS, seed=seed, settings=COARSE)
     at_once = 1 if jax.default_backend() == "cpu" else _AT_ONCE
-    thinned = on_device(coarse.source), on_device(coarse.target)
-    arguments = (params, *thinned, jnp.asarray(unit_starts, jnp.float32))
+    coarse = (
+        preparation.thinned(
+            unit,
+            budget=COARSE_POINTS,
+            neighbors=COARSE.neighbors,
+            radius=COARSE.radius,
+            seed=plan.seed,
+        )
+        for unit in (plan.source, plan.target)
+    )
+    arguments = (params, *map(on_device, coarse), jnp.asarray(starts, jnp.float32))
     proposed = timed(seconds, propose, *arguments, at_once=at_once)
     whole = on_device(plan.source), on_device(plan.target)
     found = timed(seconds, polish, *whole, proposed.motions)
     real = np.asarray(found.fits) >= 0
+    unit_motions = np.asarray(found.motions, np.float64)[real]
     return Search(
-        motions=frames.to_caller(np.asarray(found.motions)[real]),
+        unit_motions=unit_motions,
+        motions=plan.frames.to_caller(unit_motions),
         fits=np.asarray(found.fits, np.float64)[real],
-        frames=frames,
-        starts=len(unit_starts),
+        frames=plan.frames,
+        starts=len(starts),
     )
+
+
+def _turned(rotations):
+    starts = np.tile(np.eye(4), (len(rotations), 1, 1))
+    starts[:, :3, :3] = rotations
+    return starts
 
 
 def same(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Array:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import solids
 
-from cfr_jax import doubts
+from cfr_jax import calibration, doubts
 from cfr_jax.alignment import align
 
 TRUTH = solids.motion(25)
@@ -90,8 +90,14 @@ def test_small_clouds_have_fewer_neighbors_and_it_says_so(count):
 
 
 def test_where_clouds_hardly_meet_the_fitness_bounds_the_confidence():
-    assert doubts.bounded(0.99, 0.1) == 0.1 and doubts.bounded(0.05, 0.1) == 0.05
-    assert doubts.bounded(0.99, 0.6) == 0.99
+    sure, unsure = ({name: 0.0 for name in calibration.ALIGN} for _ in range(2))
+    sure["settled"], unsure["settled"] = (
+        (logit - calibration.ALIGN["bias"]) / calibration.ALIGN["settled"] for logit in (4.6, -2.9)
+    )
+
+    assert doubts.probability(sure, 0.6) == pytest.approx(0.99, abs=1e-3)
+    assert doubts.probability(sure, 0.1) == 0.1
+    assert doubts.probability(unsure, 0.1) == pytest.approx(0.052, abs=1e-3)
 
 
 def test_who_tried_one_start_is_told_of_the_search():

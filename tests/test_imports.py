@@ -37,6 +37,7 @@ LAYERS = (
     ("planning",),
     ("solving", "doubts"),
     ("search", "pyramid"),
+    ("second_look",),
     ("alignment",),
     ("batch",),
     ("reproduction",),

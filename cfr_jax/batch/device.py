@@ -20,6 +20,7 @@ from cfr_jax.planning import SETTINGS, Plan
 from cfr_jax.preparation import UnitCloud
 from cfr_jax.prepared import prepare
 from cfr_jax.registration import encode
+from cfr_jax.second_look import look_again
 
 _KEPT = 32  # encoded targets, about 2 MB each
 
@@ -27,8 +28,9 @@ _KEPT = 32  # encoded targets, about 2 MB each
 class Device:
     """What runs on the accelerator, with the targets it has encoded lately."""
 
-    def __init__(self, params: dict, refine: bool, size: int):
+    def __init__(self, params: dict, refine: bool, second_look: bool, size: int):
         self._params, self._refine, self.size = params, refine, size
+        self._second_look = refine and second_look
         self._encoded = Memo(_KEPT)
 
     def solve(self, plans: Sequence[Plan]) -> list[Alignment]:
@@ -50,9 +52,19 @@ class Device:
             "total": (done - began) / len(plans),
         }
         return [
-            answer(plan, jax.tree.map(lambda leaf, row=row: leaf[row], found), seconds)
+            self._answer(plan, jax.tree.map(lambda leaf, row=row: leaf[row], found), seconds)
             for row, plan in enumerate(plans)
         ]
+
+    def _answer(self, plan: Plan, found: solving.Found, seconds: dict[str, float]) -> Alignment:
+        """After a second look where there is doubt; those pairs are few, and looked at singly."""
+        searched = None
+        if self._second_look:
+            began = time.perf_counter()
+            seconds = dict(seconds)
+            plan, found, searched = look_again(self._params, plan, found, seconds=seconds)
+            seconds["total"] += time.perf_counter() - began
+        return answer(plan, found, seconds, searched)
 
     def _encode(self, target: UnitCloud) -> tuple[Encoded, float]:
         """The features of a target, and how long their program took to compile."""

@@ -42,6 +42,7 @@ def align_many(
     params: dict | None = None,
     refine: bool = True,
     max_points: int | None = None,
+    second_look: bool = True,
     seed: int = 0,
     batch: int | None = None,
     workers: int | None = None,
@@ -70,7 +71,8 @@ def align_many(
         batch = ON_CPU if jax.default_backend() == "cpu" else ON_ACCELERATOR
     if workers is None:
         workers = min(4, os.cpu_count() or 1)
-    device = Device(checked_params(params), refine, whole("batch", batch, least=1))
+    params = checked_params(params)
+    device = Device(params, refine, second_look, whole("batch", batch, least=1))
     workers = whole("workers", workers, least=1)
     done = _done(_Planner(budget, seed), pairs, device, workers)
     return _in_order(done) if ordered else done

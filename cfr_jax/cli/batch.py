@@ -78,6 +78,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     how = parser.add_argument_group("how to register")
     how.add_argument("--no-refine", action="store_true", help="the network's own answers")
+    how.add_argument(
+        "--no-second-look", action="store_true", help="keep first answers, also those in doubt"
+    )
     how.add_argument("--weights", metavar="W", help="a shipped name, or a .safetensors file")
     how.add_argument(
         "--max-points", metavar="N", type=numbers.positive, help="most points of each cloud"
@@ -124,6 +127,7 @@ def run(args: argparse.Namespace) -> int:
     made_with = {
         "weights": weights.sha256,
         "refine": not args.no_refine,
+        "second_look": not args.no_second_look,
         "max_points": args.max_points,
         "seed": args.seed,
     }
@@ -159,6 +163,7 @@ def _register(left: list[Job], journal: Journal, params: dict, args: argparse.Na
         (job.pair for job in left),
         params=params,
         refine=not args.no_refine,
+        second_look=not args.no_second_look,
         max_points=args.max_points,
         seed=args.seed,
         batch=args.batch_size,

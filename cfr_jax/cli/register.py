@@ -131,6 +131,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="refine further on every point of large clouds, after the thinned ones",
     )
     how.add_argument(
+        "--no-second-look",
+        action="store_true",
+        help="keep the first answer; without this, one in doubt is tried again from other starts",
+    )
+    how.add_argument(
         "--seed",
         metavar="S",
         type=numbers.not_negative,
@@ -172,6 +177,7 @@ def run(args: argparse.Namespace) -> int:
         initial=initial,
         max_points=args.max_points,
         all_points=args.all_points,
+        second_look=not args.no_second_look,
         seed=args.seed,
     )
     if args.out is not None:

@@ -46,6 +46,7 @@ def register(
     initial: Initial = None,
     max_points: int | None = None,
     all_points: bool = False,
+    second_look: bool = True,
     seed: int = 0,
 ) -> Result:
     """`align` with weights by name or path; raises ValueError as `align` and `read_weights` do."""
@@ -58,6 +59,7 @@ def register(
         initial=initial,
         max_points=max_points,
         all_points=all_points,
+        second_look=second_look,
         seed=seed,
     )
     return Result(source, target, alignment.initial, seed, chosen, alignment)
