@@ -128,7 +128,7 @@ def test_one_target_of_many_sources_is_read_prepared_and_encoded_once(tmp_path, 
 class Quick(device.Device):
     """A device that answers with the size of the source."""
 
-    def __init__(self, params, refine, size):
+    def __init__(self, params, refine, second_look, size):
         self.size, self.calls = size, []
         Quick.last = self
 
