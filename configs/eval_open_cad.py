@@ -45,10 +45,9 @@ def exact() -> dict:
         },
         **by_features(0.3),
         "cfr": network("cfr") | {"modules": True},
-        # a second cascade from where the first ended, and the refinement after it
+        # a second cascade from where the first ended
         "cfr_twice": network("cfr", cascades=2),
-        "cfr_refined": network("cfr", cascades=2, refine=True),
-        # what a user gets: that, of clouds laid about their own centroids
+        # what a user gets: that, clouds laid about their own centroids, refined, looked at again
         "cfr_align": network("cfr", refine=True, through="align"),
         # trained as long as RPM-Net was (configs/two_hours.py); left out where the file is not
         "cfr_two_hours": network("cfr") | {"weights": "cfr_two_hours"},
@@ -61,7 +60,7 @@ def exact() -> dict:
 def estimated() -> dict:
     """Those that take normals, called NAME_estimated; RPM-Net once, since both answer the same."""
     known = exact() | by_features(0.45)
-    networks = ("cfr", "cfr_twice", "cfr_refined", "cfr_align", "cfr_two_hours", "rpmnet_optim")
+    networks = ("cfr", "cfr_twice", "cfr_align", "cfr_two_hours", "rpmnet_optim")
     chosen = ("icp_plane", "gicp_jax", *by_features(0.45), *networks)
     return {
         f"{name}_estimated": known[name] | {"estimated_normals": True, "modules": False}

@@ -59,7 +59,7 @@ def arguments(tmp_path_factory):
 
 def test_the_same_seed_gives_the_same_table_whatever_draws_at_random(arguments, tmp_path):
     arguments = [a for a in arguments if not a.startswith(("--methods", "--config.threads"))]
-    methods = "--methods=icp,icp_plane,gicp,gicp_jax,fgr,fgr_icp,ransac,kiss_matcher,cfr_refined"
+    methods = "--methods=icp,icp_plane,gicp,gicp_jax,fgr,fgr_icp,ransac,kiss_matcher,cfr_align"
 
     runs = [
         evaluate(*arguments, methods, "--limit=2", f"--out={tmp_path / name}", "--noplots")
@@ -68,7 +68,7 @@ def test_the_same_seed_gives_the_same_table_whatever_draws_at_random(arguments, 
 
     tables = [(tmp_path / name / "table.md").read_text().split("## Time")[0] for name in "ab"]
     assert tables[0] == tables[1], runs[1].stderr
-    assert tables[0].count("| cfr_refined |") >= 2
+    assert tables[0].count("| cfr_align |") >= 2
     found = [json.loads((tmp_path / name / "results.json").read_text()) for name in "ab"]
     for name, method in found[0]["methods"].items():
         for pair, again in zip(method["pairs"], found[1]["methods"][name]["pairs"], strict=True):

@@ -59,7 +59,8 @@ def align_many(
     with the same points, is read and encoded once as long as it is among the last ones used.
 
     With `ordered` the outcomes come in the order of the pairs, otherwise as they are done, which
-    holds none back. Answers are those of `align` up to the rounding of float32. A pair that cannot
+    holds none back. Answers are those of `align` up to the rounding of float32; a `second_look` is
+    taken pair by pair. A pair that cannot
     be read or has no answer is an outcome with an `error`, and stops no other. Arrays given must
     not be changed before their outcome has come.
 
