@@ -94,9 +94,10 @@ def _row(corpus, number, rng):
         target = random_pair(*corpus[other], protocol, rng)
     clouds = (pair.source, pair.source_normals), (target.target, target.target_normals)
     given = [points if estimated else np.hstack([points, normals]) for points, normals in clouds]
-    found = align(*given, initial="global" if number % len(_MIX) == _SEARCHED else None)
-    # `register` alone makes one cascade
-    plan = planned(*given, initial=found.initial)
+    searched = number % len(_MIX) == _SEARCHED
+    found = align(*given, initial="global" if searched else None)
+    # `register` alone makes one cascade, and takes no second look
+    plan = planned(*given, initial=found.initial if searched else None)
     arguments = solving.on_device(plan.source), solving.on_device(plan.target)
     alone = _register(load_params(), *arguments)
     answers = np.stack([plan.frames.to_caller(np.asarray(alone.transform)), found.transform])
