@@ -13,7 +13,7 @@ import importlib
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Alignment": "alignment",
+    "Alignment": "answers",
     "align": "alignment",
     "Outcome": "batch.stream",
     "align_many": "batch.stream",

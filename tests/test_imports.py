@@ -37,7 +37,7 @@ LAYERS = (
     ("planning",),
     ("solving", "doubts"),
     ("search", "pyramid"),
-    ("second_look",),
+    ("second_look", "answers"),
     ("alignment",),
     ("batch",),
     ("reproduction",),

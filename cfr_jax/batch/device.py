@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cfr_jax import programs, solving
-from cfr_jax.alignment import Alignment, answer
+from cfr_jax.answers import Alignment, answer
 from cfr_jax.batch.memo import Memo
 from cfr_jax.iterations import Encoded
 from cfr_jax.planning import SETTINGS, Plan

@@ -12,7 +12,8 @@ from typing import Any
 import jax
 
 from cfr_jax import preparation
-from cfr_jax.alignment import Alignment, checked_params
+from cfr_jax.alignment import checked_params
+from cfr_jax.answers import Alignment
 from cfr_jax.batch.device import Device, signature
 from cfr_jax.batch.memo import Memo
 from cfr_jax.io import PointCloud, as_point_cloud

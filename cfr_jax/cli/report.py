@@ -11,7 +11,8 @@ from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
 from cfr_jax import __version__
-from cfr_jax.alignment import Alignment, Initial, align
+from cfr_jax.alignment import Initial, align
+from cfr_jax.answers import Alignment
 from cfr_jax.io import PointCloud
 from cfr_jax.viewer import Scene
 from cfr_jax.weights import DEFAULT, Weights, read_weights
