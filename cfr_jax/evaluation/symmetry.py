@@ -14,7 +14,9 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -43,16 +45,14 @@ def nearly_symmetric(pairs: Sequence[Pair], cache: Path) -> Bool[np.ndarray, " p
     if any(pair.clean_target is None for pair in pairs):
         return None
     found = json.loads(cache.read_text()) if cache.exists() else {}
-    known = len(found)
     rule = code_digest("evaluation/symmetry.py").encode()
-    keys = []
-    for pair in tqdm(pairs, "symmetries", disable=None):
-        assert pair.clean_target is not None
-        points = np.asarray(pair.clean_target, np.float64)
-        keys.append(hashlib.sha256(rule + points.tobytes()).hexdigest()[:16])
-        if keys[-1] not in found:
-            found[keys[-1]] = asymmetry(points)
-    if len(found) > known:
+    shapes = [np.asarray(pair.clean_target, np.float64) for pair in pairs]
+    keys = [hashlib.sha256(rule + points.tobytes()).hexdigest()[:16] for points in shapes]
+    todo = {k: points for k, points in zip(keys, shapes, strict=True) if k not in found}
+    if todo:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            ratios = tqdm(pool.map(asymmetry, todo.values()), "symmetries", len(todo), disable=None)
+            found |= dict(zip(todo, ratios, strict=True))
         cache.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(cache, json.dumps(found).encode())
     return np.array([found[key] <= LIMIT for key in keys])
