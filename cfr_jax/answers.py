@@ -104,7 +104,7 @@ def answer(
     determined = bool(resistance.min() >= doubts.FREE)
     weakest = np.asarray(found.quality.weakest)[resistance.argmin()]
     fitness = float(found.quality.fitness)
-    clues = {name: float(value) for name, value in confidence.named(found.clues).items()}
+    clues = confidence.named(found.clues)
     probability = doubts.probability(clues, fitness)
     neighbors = min(plan.source.neighbors.shape[1], plan.target.neighbors.shape[1])
     return Alignment(

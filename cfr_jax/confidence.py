@@ -9,7 +9,6 @@ nearer the truth the closer one's own data are to those, and mean little for oth
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -108,9 +107,10 @@ def gather(
     )
 
 
-def named(clues: Clues) -> dict[str, Any]:
-    """All clues by name."""
-    return vars(clues.network) | {k: v for k, v in vars(clues).items() if k != "network"}
+def named(clues: Clues) -> dict[str, float]:
+    """All clues of one answer by name, as numbers of the host."""
+    given = vars(clues.network) | {k: v for k, v in vars(clues).items() if k != "network"}
+    return {name: float(value) for name, value in given.items()}
 
 
 def of_registration(clues: NetworkClues) -> Float[Array, ""]:

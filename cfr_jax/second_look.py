@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
-
 from cfr_jax import confidence, doubts, solving
 from cfr_jax.planning import Plan
 from cfr_jax.search import Search, around, search
@@ -37,5 +35,4 @@ def look_again(
 
 
 def _confidence(found):
-    clues = {name: float(value) for name, value in confidence.named(found.clues).items()}
-    return doubts.probability(clues, float(np.asarray(found.quality.fitness)))
+    return doubts.probability(confidence.named(found.clues), float(found.quality.fitness))

@@ -37,6 +37,12 @@ def lopsided(count: int, seed: int, noise: float = 0.0) -> Sampled:
     return Sampled(points + noise * rng.normal(size=points.shape), normals)
 
 
+def two_samplings(count: int, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the lopsided shape, noisy, drawn twice; the second moved by `truth`."""
+    source, target = (lopsided(count, seed, 0.003).points for seed in (0, 1))
+    return source, move(truth, target)
+
+
 def plane(count: int, seed: int, noise: float = 0.0) -> Sampled:
     """A square of side two about the origin, across z."""
     rng = np.random.default_rng(seed)

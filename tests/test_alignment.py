@@ -25,8 +25,7 @@ TRUTH = solids.motion(25)
 @pytest.fixture(scope="module")
 def pair():
     """Two noisy samplings of one shape, the target moved by TRUTH."""
-    source, target = (solids.lopsided(500, seed, 0.003).points for seed in (0, 1))
-    return source, solids.move(TRUTH, target)
+    return solids.two_samplings(500, TRUTH)
 
 
 @pytest.fixture(scope="module")

@@ -32,10 +32,10 @@ def surface(sampled):
 
 @pytest.mark.parametrize("degrees", [100, 180])
 def test_a_turn_of_any_size_is_found(few_starts, degrees):
-    source, target = (solids.lopsided(256, seed, 0.003).points for seed in (0, 1))
     truth = solids.motion(degrees, (1, -1, 0.5))
+    source, target = solids.two_samplings(256, truth)
 
-    found = align(source, solids.move(truth, target), initial="global", max_points=256)
+    found = align(source, target, initial="global", max_points=256)
 
     assert solids.degrees_between(found.transform, truth) < 3
     assert (
@@ -48,14 +48,14 @@ def test_a_turn_of_any_size_is_found(few_starts, degrees):
 
 
 def test_of_several_starts_the_one_near_the_truth_is_taken(few_starts):
-    source, target = (solids.lopsided(256, seed, 0.003).points for seed in (0, 1))
     truth = solids.motion(150, (0, 1, 1))
+    source, target = solids.two_samplings(256, truth)
     starts = [solids.motion(angle, (1, 0, 0)) for angle in (0, 90)]
     starts.append(solids.motion(15, (1, 1, 0), (0.03, 0, 0)) @ truth)
 
     # as many as the cover has, so that they share its compiled program
     starts = np.resize(starts, (search.STARTS, 4, 4))
-    found = align(source, solids.move(truth, target), initial=starts, max_points=256)
+    found = align(source, target, initial=starts, max_points=256)
 
     assert solids.degrees_between(found.transform, truth) < 3
 

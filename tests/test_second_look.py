@@ -15,8 +15,7 @@ TURN = solids.motion(90, (-1, 1, 0))
 @pytest.fixture(scope="module")
 def pair():
     """Turned further than the network finds from where it lies."""
-    source, target = (solids.lopsided(256, seed, 0.003).points for seed in (0, 1))
-    return source, solids.move(TURN, target)
+    return solids.two_samplings(256, TURN)
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,7 @@ TRUTH = solids.motion(25)
 
 @pytest.fixture(scope="module")
 def pair():
-    source, target = (solids.lopsided(256, seed, 0.003).points for seed in (0, 1))
-    return source, solids.move(TRUTH, target)
+    return solids.two_samplings(256, TRUTH)
 
 
 def test_it_refines_no_worse_than_the_network_was_and_says_how(pair):

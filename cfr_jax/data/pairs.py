@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,6 +41,14 @@ class Pair:
     overlap: float | None = None
     clean_source: Float[np.ndarray, "p 3"] | None = None
     clean_target: Float[np.ndarray, "p 3"] | None = None
+
+
+def among(chosen: tuple[int, int] | None, frames: Iterable[int | str]) -> bool:
+    """Whether all `frames` of a pair are numbers from the first of `chosen` up to, not including,
+    the second; None chooses all. A name instead of a number is in no range."""
+    return chosen is None or all(
+        isinstance(frame, int) and chosen[0] <= frame < chosen[1] for frame in frames
+    )
 
 
 def open_pairs(path: str | Path) -> PairFile:

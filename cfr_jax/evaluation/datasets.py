@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from cfr_jax.data import kitti, protocol
 from cfr_jax.data.corpus import Corpus, read_corpus
 from cfr_jax.data.layout import recognize
 from cfr_jax.data.modelnet import read_modelnet40
-from cfr_jax.data.pairs import Hdf5Pairs, Pair, open_pairs
+from cfr_jax.data.pairs import Hdf5Pairs, Pair, among, open_pairs
 
 _PROTOCOLS = {
     made.name: made
@@ -111,12 +110,12 @@ def _kitti(data: Any, cache: Path) -> tuple[int, Make]:
         )
         for sequence in data.sequences
     ]
-    first, stop = data.get("frames") or (0, math.inf)
+    chosen = data.get("frames") or None
     places = [
         (part, index)
         for part in parts
         for index, frames in enumerate(part.frames.tolist())
-        if all(first <= frame < stop for frame in frames)
+        if among(chosen, frames)
     ]
 
     def make(index: int) -> Pair:
@@ -132,13 +131,7 @@ def _pairs(data: Any, cache: Path) -> tuple[int, Make]:
         return len(held), held.__getitem__
     if not isinstance(held, Hdf5Pairs):
         raise ValueError(f"data.frames: {data.path} does not say from which frames its pairs are")
-    first, stop = data.frames
-    # names instead of numbers, where a group does not tell its frames, are in no range
-    rows = [
-        row
-        for row in range(len(held))
-        if all(isinstance(frame, int) and first <= frame < stop for frame in held.frames(row))
-    ]
+    rows = [row for row in range(len(held)) if among(data.frames, held.frames(row))]
     return len(rows), lambda index: held[rows[index]]
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from cfr_jax import io, preparation
 from cfr_jax.data import kitti
 from cfr_jax.data.augment import Sampling, View, choose_rows, finish_pair
-from cfr_jax.data.pairs import Hdf5Pairs, Pair, open_pairs
+from cfr_jax.data.pairs import Hdf5Pairs, Pair, among, open_pairs
 from cfr_jax.data.protocol import crop
 
 _HELD = 256  # pairs in memory: reading one takes longer than drawing from it
@@ -78,7 +78,7 @@ def pairs_source(path: str | Path, frames: Frames = None) -> SceneSource:
                 f"frames: {path} does not say from which frames its pairs are; "
                 "make a list of pairs for training and another for validation"
             )
-        rows = [i for i in rows if all(frames[0] <= token < frames[1] for token in tokens[i])]
+        rows = [i for i in rows if among(frames, tokens[i])]
 
     def read(row: int) -> Pair:
         pair = held[rows[row]]
@@ -115,7 +115,7 @@ def kitti_source(
                 path, sequence, cache / f"truths_{sequence}_{distance:g}m.npz", distance, stride
             )
             for (a, b), transform in zip(found.frames.tolist(), found.transforms, strict=True):
-                if frames is None or frames[0] <= min(a, b) and max(a, b) < frames[1]:
+                if among(frames, (a, b)):
                     items.append((sequence, a, b, transform))
 
     def read(row: int) -> Pair:
