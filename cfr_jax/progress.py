@@ -18,6 +18,8 @@ class Progress(tqdm):
         stream = options.setdefault("file", sys.stderr)
         if not _is_terminal(stream):
             options |= {"file": _Lines(stream), "mininterval": _SECONDS, "maxinterval": _SECONDS}
+            # lines do not stack: below another bar tqdm would move the cursor
+            options["position"] = 0
             # Of a total that is not known, tqdm's own words say all there is to say.
             if _total(args, options) is not None:
                 options["bar_format"] = _PLAIN

@@ -24,6 +24,12 @@ def test_piped_progress_is_a_few_plain_lines():
     assert "registering: 200 of 200 pairs" in text and "left" in text
 
 
+def test_piped_progress_is_plain_beside_another_that_is_still_open():
+    alone = told()
+    with Progress(total=3, desc="outer", file=io.StringIO()):
+        assert told() == alone
+
+
 def test_piped_progress_without_a_known_end_is_plain_too():
     stream = io.StringIO()
     for _ in Progress(iter(range(5)), desc="reading", file=stream):
