@@ -3,9 +3,10 @@ import numpy as np
 import pytest
 
 from cfr_jax.data import build as building
-from cfr_jax.data.build import Item, build, choose_unseen, folder_items, split_of
+from cfr_jax.data.build import build, choose_unseen, folder_items, split_of
 from cfr_jax.data.comparison import compare
 from cfr_jax.data.corpus import read_corpus
+from cfr_jax.data.samples import Item
 
 POINTS = 600
 CATEGORIES = ("chair", "lamp", "table")
@@ -93,7 +94,7 @@ def test_the_same_meshes_give_the_same_bytes(meshes, tmp_path):
 
 
 def test_an_interrupted_build_resumes_to_the_same_bytes(meshes, tmp_path, monkeypatch):
-    monkeypatch.setattr(building, "_BLOCK", 4)
+    monkeypatch.setattr("cfr_jax.data.samples._BLOCK", 4)
     make(meshes, tmp_path / "whole")
     calls = []
 

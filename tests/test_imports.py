@@ -15,7 +15,7 @@ PACKAGE = ROOT / "cfr_jax"
 # A file knows what stands on the lines above its own, and the files of its own folder. A new file
 # is put in here first.
 LAYERS = (
-    ("eigen", "batching"),
+    ("eigen", "batching", "selection"),
     ("layers",),
     ("rigid", "neighbors", "normals", "features", "sinkhorn", "extraction", "pooling"),
     ("network",),
@@ -49,7 +49,7 @@ LAYERS = (
 KNOWS_ONLY = {
     "io": set(),
     "viewer": {"io", "atomic"},
-    "data": {"io", "neighbors", "progress"},
+    "data": {"io", "neighbors", "atomic", "progress"},
     "metrics": set(),
 }
 NUMERICAL_CORE = {name for layer in LAYERS[:11] for name in layer} | {"losses"}

@@ -1,17 +1,13 @@
 """Builds a corpus from meshes: each sampled, judged, held against the others, written to HDF5.
 
-What is written depends on the meshes and their names alone. The samples are kept beside the result
-while the work goes on, so an interrupted build resumes where it stopped.
+What is written depends on the meshes and their names alone.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,27 +15,15 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from cfr_jax.atomic import unfinished, write_atomically
 from cfr_jax.data.duplicates import drop_duplicates
 from cfr_jax.data.meshes import SUFFIXES, read_mesh
-from cfr_jax.data.shapes import Shape, Unfit, make_shape, name_share
-from cfr_jax.io.mesh import Mesh
+from cfr_jax.data.samples import RECIPE, Item, sampled
+from cfr_jax.data.shapes import Shape, name_share
 from cfr_jax.progress import Progress
 
-RECIPE = "1"  # counted up when the same meshes would give another corpus
 VALIDATION_SHARE = 0.2
 SPLITS = ("train", "val", "test")
-_BLOCK = 64  # shapes sampled between two saves
-
-
-@dataclass(frozen=True)
-class Item:
-    """One mesh on its way into a corpus."""
-
-    name: str  # unique; decides the random numbers and the split
-    category: str
-    load: Callable[[], Mesh]
-    least_faces: int = 20
-    stamp: str = ""  # changes when the file does
 
 
 @dataclass
@@ -132,7 +116,7 @@ def build(
     report = Report()
     kept: list[Item] = []
     shapes: list[Shape] = []
-    for item, made in _sampled(items, points, work, quiet):
+    for item, made in sampled(items, points, work, quiet):
         if isinstance(made, str):
             report.left_out[item.name] = made
         else:
@@ -156,7 +140,8 @@ def build(
     single = unseen is None
     folder = out.parent if single else out
     folder.mkdir(parents=True, exist_ok=True)
-    _write_text(folder / "shape_names.txt", "".join(f"{name}\n" for name in categories))
+    names = "".join(f"{name}\n" for name in categories)
+    write_atomically(folder / "shape_names.txt", names.encode())
     for split in ("all",) if single else SPLITS:
         chosen = [
             row for row in rows
@@ -171,68 +156,6 @@ def build(
     return report
 
 
-def _sampled(
-    items: Sequence[Item], points: int, work: Path, quiet: bool
-) -> Iterator[tuple[Item, Shape | str]]:
-    """Each item with its shape, or with the reason why it is none; saved block by block."""
-    plan = [RECIPE, points, [(i.name, i.least_faces, i.stamp) for i in items]]
-    digest = hashlib.sha256(json.dumps(plan).encode()).hexdigest()
-    folder = work / digest[:16]
-    if work.is_dir():  # samples of other meshes than these
-        for other in work.glob("[0-9a-f]" * 16):
-            if other != folder:
-                shutil.rmtree(other)
-    folder.mkdir(parents=True, exist_ok=True)
-    with Progress(total=len(items), desc="sampling", unit=" meshes", disable=quiet) as bar:
-        for start in range(0, len(items), _BLOCK):
-            block = items[start : start + _BLOCK]
-            path = folder / f"{start:06d}.npz"
-            if not path.is_file():
-                _save_block(path, [_attempt(item, points, bar) for item in block], points)
-            else:
-                bar.update(len(block))
-            yield from zip(block, _load_block(path), strict=True)
-
-
-def _attempt(item: Item, points: int, bar: Progress) -> Shape | str:
-    try:
-        return make_shape(item.load(), item.name, points, item.least_faces)
-    except Unfit as unfit:
-        return str(unfit)
-    except ValueError as error:
-        bar.write(f"left out: {error}") if not bar.disable else None
-        return "cannot be read"
-    finally:
-        bar.update(1)
-
-
-def _save_block(path: Path, made: Sequence[Shape | str], points: int) -> None:
-    shapes = [one for one in made if isinstance(one, Shape)]
-    beside = path.with_suffix(".part")
-    with open(beside, "wb") as stream:
-        np.savez(
-            stream,
-            reasons=np.array(["" if isinstance(one, Shape) else one for one in made], "U"),
-            points=np.array([s.points for s in shapes], np.float32).reshape(-1, points, 3),
-            normals=np.array([s.normals for s in shapes], np.float32).reshape(-1, points, 3),
-            spacings=np.array([s.spacing for s in shapes], np.float64),
-            fingerprints=np.array([s.fingerprint for s in shapes], "U"),
-        )
-    os.replace(beside, path)
-
-
-def _load_block(path: Path) -> Iterator[Shape | str]:
-    with np.load(path, allow_pickle=False) as saved:
-        columns = ("points", "normals", "spacings", "fingerprints")
-        shapes = zip(*(saved[column] for column in columns), strict=True)
-        for reason in saved["reasons"].tolist():
-            if reason:
-                yield reason
-            else:
-                points, normals, spacing, fingerprint = next(shapes)
-                yield Shape(points, normals, float(spacing), str(fingerprint))
-
-
 def _write_corpus(
     path: Path, items: Sequence[Item], shapes: Sequence[Shape], categories: list[str], split: str
 ) -> None:
@@ -241,9 +164,11 @@ def _write_corpus(
     normal = np.round(np.stack([shape.normals for shape in shapes]) * 127).astype(np.int8)
     labels = np.array([[categories.index(item.category)] for item in items])
     chunks = (min(32, len(data)), *data.shape[1:])
-    beside = path.with_name(f".{path.name}.part")
     # No times and no tracking of anything: the same corpus is the same bytes.
-    with h5py.File(beside, "w", libver="v110", track_order=False) as file:
+    with (
+        unfinished(path) as beside,
+        h5py.File(beside, "w", libver="v110", track_order=False) as file,
+    ):
         packed = {"chunks": chunks, "compression": "gzip", "track_times": False}
         file.create_dataset("data", data=data, **packed)
         file.create_dataset("normal", data=normal, **packed).attrs["scale"] = 1 / 127
@@ -253,10 +178,3 @@ def _write_corpus(
         file.create_dataset("names", data=names, dtype=h5py.string_dtype(), track_times=False)
         file.attrs["split"] = split
         file.attrs["recipe"] = RECIPE
-    os.replace(beside, path)
-
-
-def _write_text(path: Path, text: str) -> None:
-    beside = path.with_name(f".{path.name}.part")
-    beside.write_text(text)
-    os.replace(beside, path)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from cfr_jax.atomic import unfinished
 from cfr_jax.data.pairs import Pair
 from cfr_jax.data.protocol import random_motion, resample
 from cfr_jax.data.scans import estimate_normals, refine_point_to_plane, voxel_mean
@@ -215,7 +215,5 @@ def _load(path: Path, made_for: str) -> tuple[np.ndarray, np.ndarray] | None:
 
 def _save(path: Path, made_for: str, transforms: np.ndarray, fitness: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    with open(beside, "wb") as file:
+    with unfinished(path) as beside, open(beside, "wb") as file:
         np.savez(file, made_for=made_for, transforms=transforms, fitness=fitness)
-    os.replace(beside, path)

@@ -8,7 +8,6 @@ and no checkpoint is chosen by them.
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import zipfile
@@ -19,10 +18,12 @@ from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
 
-from cfr_jax.data.build import Item, Report, build
+from cfr_jax.atomic import write_atomically
+from cfr_jax.data.build import Report, build
 from cfr_jax.data.furniture import FurnitureLibrary
 from cfr_jax.data.meshes import parse_pmd, read_mesh
 from cfr_jax.data.packages import download, extract, find_deb, version_of
+from cfr_jax.data.samples import Item
 from cfr_jax.io.mesh import Mesh
 
 UNSEEN = (
@@ -136,11 +137,9 @@ def unpack(
     paths = sorted(extract(deb, lambda name: wanted.search(name) is not None, into, quiet))
     if not paths:
         raise ValueError(f"{deb} holds no file like {source.files}: is it another version?")
-    part = done.with_suffix(".part")
     version = version_of(deb)
     files = [path.relative_to(work).as_posix() for path in paths]
-    part.write_text(json.dumps({"version": version, "files": files}))
-    os.replace(part, done)
+    write_atomically(done, json.dumps({"version": version, "files": files}).encode())
     if debs is None:
         deb.unlink()
     return paths, version

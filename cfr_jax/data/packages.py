@@ -18,6 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 from urllib.parse import unquote
 
+from cfr_jax.atomic import unfinished
 from cfr_jax.progress import Progress
 
 _MAGIC = b"!<arch>\n"
@@ -86,12 +87,10 @@ def extract(
             if path.is_file() and path.stat().st_size == member.size:
                 continue
             path.parent.mkdir(parents=True, exist_ok=True)
-            beside = path.with_name(path.name + ".part")
             content = tar.extractfile(member)
             assert content is not None  # regular files have content
-            with content, open(beside, "wb") as stream:
+            with content, unfinished(path) as beside, open(beside, "wb") as stream:
                 shutil.copyfileobj(content, stream, 1 << 20)
-            os.replace(beside, path)
     return written
 
 

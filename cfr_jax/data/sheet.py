@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import io
-import os
 from pathlib import Path
 
 import numpy as np
 
+from cfr_jax.atomic import write_atomically
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.shapes import name_share
 
@@ -55,9 +55,7 @@ def write_sheet(path: Path, corpus: Corpus, columns: int = 8) -> None:
             axes.set_axis_off()
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=_DPI, metadata={"Software": None})
-    beside = path.with_name(f".{path.name}.part")
-    beside.write_bytes(png.getvalue())
-    os.replace(beside, path)
+    write_atomically(path, png.getvalue())
 
 
 def _view() -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import jax
 import numpy as np
 import tqdm
 
+from cfr_jax.atomic import write_atomically
 from cfr_jax.losses import PairLoss
 
 
@@ -55,9 +55,7 @@ class Journal:
         self.path = path
         # what an interrupted run measured after its last checkpoint will be measured again
         lines = [line for line in read_journal(path) if line["step"] <= step]
-        beside = path.with_name(f".{path.name}.{os.getpid()}")
-        beside.write_text("".join(json.dumps(line) + "\n" for line in lines), "utf-8")
-        os.replace(beside, path)
+        write_atomically(path, "".join(json.dumps(line) + "\n" for line in lines).encode())
 
     def write(self, line: dict) -> None:
         """Appends one line. Raises OSError, naming the file, where that cannot be written."""
