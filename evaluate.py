@@ -8,8 +8,10 @@ import shlex
 import sys
 from pathlib import Path
 
-from absl import app, flags
+from absl import flags, logging
 from ml_collections import config_flags
+
+from cfr_jax.cli import configured
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "The data, the methods, their settings.")
 _OUT = flags.DEFINE_string("out", None, "Folder for results.json, table.md, plots and gallery.")
@@ -24,6 +26,7 @@ def main(_) -> None:
     """Everything of interest is in `cfr_jax.evaluation`."""
     from cfr_jax.evaluation.comparison import compare
 
+    logging.set_verbosity(logging.ERROR)  # JAX tells of every backend that is not there
     config = _CONFIG.value
     for name, flag in (("weights", _WEIGHTS), ("limit", _LIMIT), ("seed", _SEED)):
         if flag.value is not None:
@@ -37,4 +40,4 @@ def main(_) -> None:
 
 if __name__ == "__main__":
     flags.mark_flags_as_required(["config", "out"])
-    app.run(main)
+    configured.run(main)

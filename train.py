@@ -1,13 +1,32 @@
 """Trains the network: python train.py --config=configs/open_cad.py --workdir=runs/open_cad
 
-Any field of the config can be set on the command line, as in --config.train.peak_rate=3e-4. Run the
-same command again and it goes on from the last checkpoint in the workdir.
+A config is a Python file. Of those in configs/, each with its fields explained:
+
+    open_cad.py    the open CAD corpus, about two hours on two cores; every field stands here
+    object.py      the same at length: the weights `object`
+    scans.py       fine-tuning on real scans: the weights `scan`
+    own_scans.py   scans of your own (docs/train-on-your-data.md)
+
+Any field can be set on the command line, one of a list by its place:
+
+    python train.py --config=configs/open_cad.py --workdir=runs/mine \\
+        --config.data.train=corpus/train.h5 --config.data.validation=corpus/val.h5 \\
+        --config.train.start_from=object --config.train.peak_rate=3e-4 \\
+        '--config.phases[0].steps=500'
+
+Stop it by Ctrl-C, or in any other way: the same command goes on from the last checkpoint in the
+workdir. What it finds goes to metrics.jsonl, summary.html and TensorBoard files there, and the best
+weights to weights.safetensors, for `cfr register --weights`.
 """
 
+import sys
+import warnings
 from pathlib import Path
 
-from absl import app, flags, logging
+from absl import flags, logging
 from ml_collections import config_flags
+
+from cfr_jax.cli import configured
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "What to train, on what, and how long.")
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of checkpoints, metrics and weights.")
@@ -22,23 +41,37 @@ def main(_) -> None:
     """Everything of interest is in `cfr_jax.training.loop`."""
     import jax
 
-    from cfr_jax.training import devices, loop
+    from cfr_jax.cli.cache import keep_compiled_programs
+    from cfr_jax.training import devices, loop, stopping, validation
 
     # orbax writes pages about a full disk; what went wrong is said below, once
     logging.set_verbosity(logging.FATAL)
+    warnings.showwarning = _warn
+    workdir = Path(_WORKDIR.value)
     try:
         if not _COORDINATOR.value:
             cores = devices.of_cores(*(phase["batch"] for phase in _CONFIG.value.phases))
             if cores is not None:
                 jax.config.update("jax_num_cpu_devices", cores)
+        keep_compiled_programs()
         devices.join(_COORDINATOR.value, _PROCESSES.value, _PROCESS.value)
-        best = loop.run(_CONFIG.value, Path(_WORKDIR.value))
+        best = loop.run(_CONFIG.value, workdir)
     except (ValueError, OSError) as error:
         raise SystemExit(f"train.py: error: {error}") from error
+    except stopping.Stopped as stopped:
+        print(f"train.py: {stopped}", file=sys.stderr)
+        sys.exit(128 + stopped.signal)
     if devices.is_first():
-        print(f"best validation at step {best['step']}: {best}")
+        made = workdir / loop.WEIGHTS
+        print(f"best at step {best['step']}: {validation.in_words(best)}")
+        print(f"weights: {made}; the whole run: {workdir / 'summary.html'}")
+        print(f"to use them: cfr register a.ply b.ply --weights {made}")
+
+
+def _warn(message, *_) -> None:
+    print(f"train.py: {message}", file=sys.stderr)
 
 
 if __name__ == "__main__":
     flags.mark_flags_as_required(["config", "workdir"])
-    app.run(main)
+    configured.run(main)

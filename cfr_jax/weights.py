@@ -12,11 +12,11 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from cfr_jax import network as cfr_network
 from cfr_jax import rpmnet
-from cfr_jax.atomic import unfinished
+from cfr_jax.atomic import write_atomically
 
 SHIPPED = Path(__file__).parent / "models"
 DEFAULT = "object"
@@ -48,9 +48,9 @@ def save_params(path: str | Path, params: dict, notes: dict[str, str] | None = N
     path, notes = Path(path), dict(notes or {})
     tensors = {name: np.asarray(leaf) for name, leaf in flatten_dict(params, sep="/").items()}
     try:
-        with unfinished(path) as beside:
-            save_file(tensors, beside, metadata=notes | {"sha256": _digest(tensors, notes)})
-    except (SafetensorError, OSError) as error:
+        # as bytes: a file that safetensors writes is closed to everyone but its owner
+        write_atomically(path, save(tensors, metadata=notes | {"sha256": _digest(tensors, notes)}))
+    except OSError as error:
         raise OSError(f"weights: {path} could not be written ({error})") from error
 
 

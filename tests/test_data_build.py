@@ -85,6 +85,8 @@ def test_what_is_left_out_is_told_with_its_reason(meshes, tmp_path):
         "lamp/twice.obj": "repeats lamp/deep/4.off",
     }
     assert report.reasons["repeats another"] == 1
+    lines = report.left_out_file.read_text().splitlines()
+    assert lines == [f"{name}: {why}" for name, why in sorted(report.left_out.items())]
 
 
 def test_the_same_meshes_give_the_same_bytes(meshes, tmp_path):

@@ -84,6 +84,14 @@ def test_a_folder_of_ply_is_clouds_or_meshes_as_its_headers_say(tmp_path):
     assert recognize(clouds(tmp_path / "c", "a.ply")).kind == "clouds"
 
 
+def test_a_readme_among_meshes_makes_no_folder_of_clouds(tmp_path):
+    for name in ("a.stl", "b.obj", "readme.txt"):
+        (tmp_path / name).write_text("")
+
+    assert str(recognize(tmp_path)).endswith("2 meshes (.obj, .stl)")
+    assert recognize(tmp_path, "clouds").found == "1 point clouds (.txt)"
+
+
 def test_the_kind_can_be_overruled_but_has_to_fit(tmp_path):
     make("clouds", tmp_path)
     assert recognize(tmp_path, "clouds").kind == "clouds"

@@ -1,6 +1,8 @@
 """A whole training: it resumes bit for bit, leaves what it measured, and says why it stops."""
 
 import json
+import os
+import signal
 
 import jax
 import numpy as np
@@ -9,8 +11,10 @@ import training_samples as samples
 from training_samples import assert_same, config
 
 from cfr_jax import weights
-from cfr_jax.training import devices, learner, loop, step, validation
+from cfr_jax.data.augment import Sampling
+from cfr_jax.training import devices, learner, loop, optimizers, step, validation
 from cfr_jax.training.checkpoints import Checkpoints, SaveError
+from cfr_jax.training.stopping import Stopped
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +30,7 @@ def run(given, folder):
     with pytest.MonkeyPatch.context() as patch, jax.numpy_dtype_promotion("standard"):
         patch.setattr(validation, "validate", samples.cheap_validation)
         # the same optimizer compiles once
-        patch.setattr(loop.optimizers, "make_optimizer", lambda *_, **__: samples.optimizer())
+        patch.setattr(optimizers, "make_optimizer", lambda *_, **__: samples.optimizer())
         return loop.run(given, folder)
 
 
@@ -133,17 +137,85 @@ def test_a_checkpoint_says_all_that_a_run_needs(whole):
     assert about["clock"]["seconds"] > 0 and about["clock"]["processor_seconds"] > 0
 
 
-def test_another_config_goes_on_with_a_word(corpus_file, tmp_path, killed_in_step):
+def test_another_config_goes_on_with_a_word(corpus_file, tmp_path, killed_in_step, capsys):
     killed_in_step(6)
     with pytest.raises(Killed):
         run(config(corpus_file), tmp_path)
     changed = config(corpus_file)
     changed.keep_checkpoints = 3
+    capsys.readouterr()
 
-    with pytest.warns(UserWarning, match="differs from the checkpoint's in keep_checkpoints"):
-        run(changed, tmp_path)
+    run(changed, tmp_path)
 
+    told = capsys.readouterr().out
+    assert "going on from step 4" in told and "keep_checkpoints 2 → 3" in told
     assert int(state_of(tmp_path).step) == 16
+
+
+def test_a_workdir_of_other_training_data_is_refused(tmp_path, whole):
+    other = config(samples.write_corpus(tmp_path / "other.h5", shapes=5))
+
+    with pytest.raises(ValueError, match="other data.train .*4 shapes.*5 shapes.*start_from="):
+        run(other, whole[0])
+
+
+def test_other_validation_pairs_forget_what_was_best(corpus_file, tmp_path, killed_in_step, capsys):
+    killed_in_step(6)
+    with pytest.raises(Killed):
+        run(config(corpus_file), tmp_path)
+    changed = config(corpus_file)
+    changed.validation_pairs = 3
+
+    best = run(changed, tmp_path)
+
+    assert "best so far is forgotten" in capsys.readouterr().out
+    assert best["step"] >= 8
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_asked_to_stop_it_saves_and_goes_on_to_the_same_end(
+    corpus_file, tmp_path, whole, monkeypatch, number
+):
+    train_step = step.train_step
+
+    def asked_in_step_6(state, batch, **named):
+        if int(state.step) == 5:
+            os.kill(os.getpid(), number)
+        return train_step(state, batch, **named)
+
+    before = signal.getsignal(number)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(step, "train_step", asked_in_step_6)
+        with pytest.raises(Stopped, match="stopped at step 6 of 16, all saved") as stopped:
+            run(config(corpus_file), tmp_path)
+    assert stopped.value.signal == number and signal.getsignal(number) == before
+    assert int(state_of(tmp_path).step) == 6
+    assert (tmp_path / "summary.html").is_file()
+
+    assert run(config(corpus_file), tmp_path) == whole[1]
+    assert_same(state_of(tmp_path), state_of(whole[0]))
+
+
+def test_weights_to_start_from_are_measured_first_and_kept_if_no_better_come(
+    corpus_file, tmp_path, whole, monkeypatch
+):
+    begun = whole[0] / "weights.safetensors"
+    given = config(corpus_file)
+    given.train.start_from = str(begun)
+    found = samples.cheap_validation
+
+    def worse_every_time(chosen, params, placed, truth, mesh):
+        same = np.array_equal(
+            params["features"]["kernel_1"], weights.load_params(begun)["features"]["kernel_1"]
+        )
+        return found(chosen, params, placed, truth, mesh) | {"rotation_mean": 1.0 + (not same)}
+
+    monkeypatch.setattr(samples, "cheap_validation", worse_every_time)
+    best = run(given, tmp_path)
+
+    assert best["step"] == 0 and best["rotation_mean"] == 1.0
+    assert [line["step"] for line in lines_of(tmp_path) if "validation" in line][0] == 0
+    assert_same(weights.load_params(tmp_path / "weights.safetensors"), weights.load_params(begun))
 
 
 def test_gradients_that_stay_infinite_stop_the_run(corpus_file, tmp_path, monkeypatch):
@@ -194,6 +266,8 @@ def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monk
         ({"train.workers": 0}, "workers: got 0"),
         ({"data.train": "nowhere.h5"}, "nowhere.h5"),
         ({"sampling.keep": (0.0, 2.0)}, "keep"),
+        ({"sampling.keep": (0.5, 0.3)}, "keep: got .*the lower one first"),
+        ({"sampling.angle": -5.0}, "angle, translation: got -5.0"),
     ],
 )
 def test_what_a_config_has_wrong_is_named(corpus_file, tmp_path, change, wanted):
@@ -210,7 +284,7 @@ def test_validation_measures_the_last_transform(corpus_file, monkeypatch):
     from cfr_jax.training import sources
 
     held_out = sources.open_mixture(str(corpus_file), corpus_file.parent, "data.validation")
-    pairs = sources.fixed_pairs(held_out, 3, 24, 64, 0.3)
+    pairs = sources.fixed_pairs(held_out, 3, Sampling(points=100, neighbors=64))
     assert pairs["source"].shape == (3, 717, 3)
     assert pairs["source_neighbors"].shape == (3, 717, 64)
     off = np.array(pairs["transform"], np.float32)[:, None].repeat(2, axis=1)

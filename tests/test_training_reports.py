@@ -69,6 +69,7 @@ def about():
         "best": {"step": 4, "rotation_mean": 3.25, "rotation_median": 1.5,
                  "translation_mean": 0.04, "recall_5deg_0.1": 0.75},
         "step": 6, "skipped": 1, "position": 48, "clock": {"seconds": 7200, "processor_seconds": 1},
+        "data": {"data.train": "30 shapes, ab12", "data.validation": "3 shapes, cd34"},
         "versions": {"jax": "1.2.3"}, "config": {"seed": "<b>0</b>"},
     }  # fmt: skip
 
@@ -79,8 +80,8 @@ def test_the_page_draws_every_curve_and_needs_nothing_from_elsewhere(tmp_path, a
     write_summary(tmp_path / "summary.html", lines, about)
 
     page = (tmp_path / "summary.html").read_text()
-    assert page.count("<polyline") == 2 + 3 + 2 + 1 + 1 + 1 + L + L
-    for text in ("3.25°", "2.00 h", "jax 1.2.3", "step 4", "&lt;b&gt;0&lt;/b&gt;"):
+    assert page.count("<polyline") == 3 + 3 + 2 + 1 + 1 + 1 + L + L
+    for text in ("3.25°", "2.00 h", "3 shapes", "jax 1.2.3", "step 4", "&lt;b&gt;0&lt;/b&gt;"):
         assert text in page, text
     assert "http" not in page and "<script" not in page
 
@@ -140,7 +141,7 @@ def test_the_bar_tells_loss_errors_speed_and_the_time_left():
     )
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
 
-    for text in ("5/10", "step", "<", "loss=1.500", "RE=3.2", "TE=0.125"):
+    for text in ("5 of 10 steps", "left", "loss=1.500", "RE=3.2", "TE=0.125"):
         assert text in child.stderr, child.stderr
 
 

@@ -87,7 +87,7 @@ def test_the_same_seed_draws_the_same_pair(pairs_file):
 def test_frames_choose_the_pairs_that_lie_within_them(pairs_file):
     assert scenes.pairs_source(pairs_file, (0, 4)).names == ("pair_0", "pair_1")
     assert scenes.pairs_source(pairs_file, (3, 9)).names == ("pair_2", "pair_3")
-    with pytest.raises(ValueError, match="none within `frames`"):
+    with pytest.raises(ValueError, match="some within `frames`"):
         scenes.pairs_source(pairs_file, (100, 200))
 
 
@@ -174,6 +174,84 @@ def test_a_drive_gives_pairs_at_several_distances_within_its_frames(drive, tmp_p
     assert np.isfinite(moved).all() and len(list(tmp_path.glob("truths_00_*.npz"))) == 2
 
 
+def test_of_a_single_scan_two_views_are_validated_on_and_a_recorded_pair_as_it_is(
+    pairs_file, tmp_path, surface
+):
+    io.write(tmp_path / "a.ply", io.PointCloud(surface))
+    sampling = Sampling(points=300, neighbors=20, keep=(0.5, 0.6), noise=(0.0, 0.0))
+
+    def shared(**about):
+        held = sources.open_mixture(given(room=about), tmp_path, "data.validation")
+        pairs = sources.fixed_pairs(held, 1, sampling)
+        moved = pieces.move(pairs["transform"][0].astype(np.float64), pairs["source"][0])
+        gap = np.linalg.norm(moved[:, None] - pairs["target"][0], axis=-1).min(axis=1)
+        return (gap < 1e-3).mean()
+
+    assert shared(kind="scans", path=str(tmp_path)) < 0.9
+    assert shared(kind="pairs", path=str(pairs_file)) > 0.98
+
+
+def test_scans_that_cannot_be_read_are_all_named_before_any_training(tmp_path, surface):
+    scans, cache = tmp_path / "scans", tmp_path / "cache"
+    scans.mkdir(), cache.mkdir()
+    io.write(scans / "a.ply", io.PointCloud(surface))
+    (scans / "readme.md").write_text("no scan, and none is looked for here")
+    (scans / "b.ply").write_bytes((scans / "a.ply").read_bytes()[:-100])
+    (scans / "c.txt").write_text("hello\n")
+
+    def opened():
+        about = {"kind": "scans", "path": str(scans)}
+        return sources.open_mixture(given(mine=about), cache, "data.train")
+
+    with pytest.raises(
+        ValueError, match=r"data.train: 2 scans cannot be used.*\n.*b\.ply.*\n.*c\.txt"
+    ):
+        sources.check_readable(opened(), cache, "data.train")
+    for name in ("b.ply", "c.txt"):
+        (scans / name).unlink()
+    mixture = opened()
+    sources.check_readable(mixture, cache, "data.train")
+    reads = mixture.sources[0].read.cache_info().misses
+    again = opened()
+    sources.check_readable(again, cache, "data.train")
+    assert reads == 1 and again.sources[0].read.cache_info().misses == 0  # remembered
+
+
+def test_the_stamp_of_data_goes_by_what_they_are_and_not_by_where_they_lie(tmp_path, surface):
+    def stamp(folder, clouds, repeat=1):
+        (tmp_path / folder).mkdir()
+        for name, cloud in clouds.items():
+            io.write(tmp_path / folder / name, io.PointCloud(cloud))
+        about = {"kind": "scans", "path": str(tmp_path / folder), "repeat": repeat}
+        return sources.stamp(sources.open_mixture(given(a=about), tmp_path, "data.train"))
+
+    first = stamp("one", {"a.ply": surface})
+    assert first.startswith("1 single scans, ")
+    assert stamp("moved", {"a.ply": surface}) == first
+    assert stamp("longer", {"a.ply": surface[:200]}) != first
+    assert stamp("named", {"b.ply": surface}) != first
+    assert stamp("twice", {"a.ply": surface}, repeat=2) != first
+
+
+def test_lists_share_a_scan_where_they_name_one_file(tmp_path, surface, motion):
+    for name in ("a.ply", "b.ply", "c.ply"):
+        io.write(tmp_path / name, io.PointCloud(surface))
+    numbers = ",".join(map(repr, motion.ravel().tolist()))
+    (tmp_path / "train.csv").write_text(f"a.ply,b.ply,{numbers}\n")
+    (tmp_path / "val.csv").write_text(f"c.ply,./b.ply,{numbers}\n")
+
+    def opened(name):
+        about = {"kind": "pairs", "path": str(tmp_path / name)}
+        return sources.open_mixture(given(a=about), tmp_path, "data.train")
+
+    with pytest.raises(ValueError, match="1 of its 2 scans are in data.train, too"):
+        sources.check_apart(opened("train.csv"), opened("val.csv"))
+    about = {"kind": "scans", "path": str(tmp_path)}
+    folder = sources.open_mixture(given(a=about), tmp_path, "data.validation")
+    with pytest.raises(ValueError, match="2 of its 3 scans are in data.train, too"):
+        sources.check_apart(opened("train.csv"), folder)
+
+
 def test_named_sources_are_mixed_as_often_as_told(pairs_file, tmp_path):
     mixture = sources.open_mixture(
         given(
@@ -191,7 +269,8 @@ def test_validation_pairs_are_the_same_every_time(pairs_file, tmp_path):
     about = {"kind": "pairs", "path": str(pairs_file), "repeat": 2}
     held = sources.open_mixture(given(room=about), tmp_path, "data.validation")
 
-    first, second = (sources.fixed_pairs(held, 10, 40, 64, 0.3) for _ in range(2))
+    sampling = Sampling(points=40, neighbors=39, keep=(0.5, 0.5))
+    first, second = (sources.fixed_pairs(held, 10, sampling) for _ in range(2))
 
     assert first["source"].shape == (6, 40, 3) and first["source_neighbors"].shape == (6, 40, 39)
     for key in first:
@@ -205,6 +284,7 @@ def test_validation_pairs_are_the_same_every_time(pairs_file, tmp_path):
         ({"kind": "scans", "path": "nowhere"}, "no folder of scans at nowhere"),
         ({"kind": "scans", "path": "a", "frames": (0, 1)}, "scans got .*frames.*wanted path"),
         ({"kind": "pairs"}, "wanted path"),
+        ({"kind": "scans", "path": ""}, "data.train.mine.path: none given"),
         ({"kind": "pairs", "path": "a", "repeat": -1}, "repeat: got -1"),
         ({"kind": "pairs", "path": "a", "repeat": 0}, "no source"),
     ],

@@ -23,7 +23,8 @@ Builds the corpora that networks are trained and tested on, and shows what is in
 _BUILD = """\
 Turns a folder of meshes (.off .obj .stl .ply .glb .gltf .pmd .ac) into a corpus: 2048 points a
 shape, drawn by area, with the normals of their faces, in the unit sphere. The first folder below
-FOLDER is the category. Flat shapes, shapes of few faces, and duplicates are left out.
+FOLDER is the category. Flat shapes, shapes of fewer than 20 faces (a box has 12: --least-faces),
+and duplicates are left out; left_out.txt, beside the corpus, names them.
 
   cfr data build meshes/ --out corpus/ --unseen lamp,seat    train.h5, val.h5, test.h5
   cfr data build meshes/ --out corpus.h5                     all shapes in one file
@@ -47,6 +48,8 @@ _INFO = """\
 What FILE is, told by its layout, and what a corpus holds: shapes by category, points a shape. A
 corpus is an HDF5 file in the layout of modelnet40_ply_hdf5_2048, or a folder of them.
 """
+
+_ENOUGH = 30  # shapes to validate on
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
@@ -73,9 +76,15 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     build.add_argument(
         "--unseen", metavar="A,B,...", help="categories for test.h5 ('none' for none of them)"
     )
-    build.add_argument("--points", metavar="N", type=int, default=2048, help="points a shape")
     build.add_argument(
-        "--least-faces", metavar="N", type=int, default=20, help="fewer, and a mesh is left out"
+        "--points", metavar="N", type=int, default=2048, help="points a shape (2048)"
+    )
+    build.add_argument(
+        "--least-faces",
+        metavar="N",
+        type=int,
+        default=20,
+        help="fewer, and a mesh is left out (20)",
     )
 
     open_cad = commands.add_parser(
@@ -196,6 +205,12 @@ def _print_report(report: Report, out: Path) -> None:
     for split, counts in report.counts.items():
         categories = sum(count > 0 for count in counts.values())
         print(f"{split:11s} {sum(counts.values())} shapes of {categories} categories")
+    few = sum(report.counts["val"].values()) if "val" in report.counts else _ENOUGH
+    if few < _ENOUGH:
+        print(f"few         {few} shapes to validate on: with fewer than {_ENOUGH}, which weights")
+        print("            are best is a matter of chance; more meshes, or another --unseen")
     for why, count in report.reasons.most_common():
         print(f"left out    {count}: {why}")
     print(f"wrote       {out}")
+    if report.left_out:
+        print(f"            {report.left_out_file}: what was left out, by name")

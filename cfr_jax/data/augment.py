@@ -75,9 +75,17 @@ class Sampling:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: got {getattr(self, name)}, wanted a share from 0 to 1")
         for name in _RANGES:
-            low, high = getattr(self, name)
-            if not 0 <= low <= high:
-                raise ValueError(f"{name}: got ({low}, {high}), wanted a range of numbers from 0")
+            given = getattr(self, name)
+            if not (np.shape(given) == (2,) and 0 <= given[0] <= given[1]):
+                raise ValueError(
+                    f"{name}: got {given}, wanted two numbers from 0 on, the lower one first"
+                )
+        if not (self.angle >= 0 and self.translation >= 0):
+            raise ValueError(
+                f"angle, translation: got {self.angle} and {self.translation}, wanted 0 or more"
+            )
+        if self.points < 2:
+            raise ValueError(f"points: got {self.points}, wanted at least 2")
         if not (self.keep[0] > 0 and self.keep[1] <= 1 and self.outliers[1] < 1):
             raise ValueError(
                 f"keep, outliers: got {self.keep} and {self.outliers}, wanted shares of the points"

@@ -32,6 +32,7 @@ class Report:
 
     counts: dict[str, Counter[str]] = field(default_factory=dict)  # split → category → shapes
     left_out: dict[str, str] = field(default_factory=dict)  # name → why
+    left_out_file: Path | None = None  # which tells that, where anything was
 
     @property
     def shapes(self) -> int:
@@ -98,7 +99,8 @@ def build(
     categories: Sequence[str] | None = None,
 ) -> Report:
     """Writes a corpus: `train.h5`, `val.h5`, `test.h5` into the folder `out`, or all shapes into
-    one file `out` if `unseen` is None. `shape_names.txt` comes beside.
+    one file `out` if `unseen` is None. Beside come `shape_names.txt`, and `left_out.txt` (of one
+    file `NAME.left_out.txt`) with what was left out and why.
 
     Labels are places among `categories`, sorted; by default those that occur. Raises ValueError
     where no item is fit, or where items share a name.
@@ -152,6 +154,12 @@ def build(
             path = out if single else out / f"{split}.h5"
             _write_corpus(path, [kept[row] for row in chosen], [shapes[row] for row in chosen],
                           categories, split)  # fmt: skip
+    left_out = folder / (f"{out.stem}.left_out.txt" if single else "left_out.txt")
+    left_out.unlink(missing_ok=True)
+    if report.left_out:
+        lines = (f"{name}: {why}\n" for name, why in sorted(report.left_out.items()))
+        write_atomically(left_out, "".join(lines).encode())
+        report.left_out_file = left_out
     shutil.rmtree(work, ignore_errors=True)
     return report
 

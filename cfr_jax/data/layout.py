@@ -61,6 +61,8 @@ def recognize(path: str | Path, kind: str | None = None) -> Layout:
     chosen = (kind,) if kind is not None else KINDS
     for name in chosen:
         if (found := _TESTS[name](path)) is not None:
+            if kind is None and name == "clouds" and _mostly_meshes(path):
+                continue  # a readme.txt beside them is no cloud
             return Layout(name, path, found)
     if kind is not None:
         raise ValueError(f"{path} is not laid out as {kind}: it holds {_contents(path)}")
@@ -140,23 +142,31 @@ def _kitti(path: Path) -> str | None:
 
 
 def _clouds(path: Path) -> str | None:
-    return _loose(path, CLOUD_SUFFIXES, "point clouds", surfaces=False)
+    return _in_words("point clouds", _loose(path, CLOUD_SUFFIXES, surfaces=False))
 
 
 def _meshes(path: Path) -> str | None:
-    return _loose(path, MESH_SUFFIXES, "meshes", surfaces=True)
+    return _in_words("meshes", _loose(path, MESH_SUFFIXES, surfaces=True))
 
 
-def _loose(path: Path, suffixes: tuple[str, ...], name: str, surfaces: bool) -> str | None:
+def _mostly_meshes(path: Path) -> bool:
+    clouds = _loose(path, CLOUD_SUFFIXES, surfaces=False)
+    return _loose(path, MESH_SUFFIXES, surfaces=True).total() > clouds.total()
+
+
+def _in_words(name: str, kinds: Counter[str]) -> str | None:
+    return f"{kinds.total()} {name} ({', '.join(sorted(kinds))})" if kinds else None
+
+
+def _loose(path: Path, suffixes: tuple[str, ...], surfaces: bool) -> Counter[str]:
+    """How many files of each suffix, those that may be either being what their headers say."""
     if not path.is_dir():
-        return None
+        return Counter()
     files = loose_files(path, suffixes)
     either = [file for file in files if file.suffix.lower() in _EITHER]
     # A folder's PLY files are taken to be alike: a few of them tell.
     fits = any(_has_faces(file) == surfaces for file in either[:_PEEKED])
-    count = len(files) if fits else len(files) - len(either)
-    kinds = Counter(file.suffix.lower() for file in files if fits or file not in either)
-    return f"{count} {name} ({', '.join(sorted(kinds))})" if count else None
+    return Counter(file.suffix.lower() for file in files if fits or file not in either)
 
 
 def _has_faces(path: Path) -> bool:

@@ -9,10 +9,10 @@ from typing import Any
 
 import jax
 import numpy as np
-import tqdm
 
 from cfr_jax.atomic import write_atomically
 from cfr_jax.losses import PairLoss
+from cfr_jax.progress import Progress
 
 
 class Clock:
@@ -98,13 +98,16 @@ class Bar:
     """Loss, errors, steps per second and the time left, on standard error."""
 
     def __init__(self, total: int, step: int, shown: bool):
-        self._bar = tqdm.tqdm(
-            total=total, initial=step, unit="step", mininterval=5, disable=not shown
-        )
+        options = {"total": total, "initial": step, "disable": not shown, "mininterval": 5}
+        self._bar = Progress(desc="training", unit=" steps", **options)
 
     def step(self, step: int) -> None:
         """Steps done so far."""
         self._bar.update(step - self._bar.n)
+
+    def forget_time(self) -> None:
+        """What went by since the last step is not counted: it says nothing of those to come."""
+        self._bar.unpause()
 
     def measured(self, line: dict) -> None:
         """Shows the newest means: rotation error in degrees, translation error in radii."""

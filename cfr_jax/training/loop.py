@@ -2,145 +2,148 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import json
-import platform
-import time
-import warnings
+import dataclasses
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-from cfr_jax import __version__, weights
-from cfr_jax.data.augment import Sampling
+from cfr_jax import weights
 from cfr_jax.data.batches import batches
-from cfr_jax.training import devices, optimizers, sources, step, validation
+from cfr_jax.training import devices, record, step, stopping, validation
 from cfr_jax.training.checkpoints import Checkpoints
-from cfr_jax.training.learner import Phase, learner, remaining
+from cfr_jax.training.learner import Phase, remaining
 from cfr_jax.training.reports import Reports
+from cfr_jax.training.step import TrainState
+from cfr_jax.training.task import Task, fresh_params, prepare
 
-_NAMED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+WEIGHTS = "weights.safetensors"
+
+
+class Diverged(ValueError):
+    """Too many steps in a row had a gradient that is not finite."""
 
 
 def run(config: Any, workdir: Path) -> dict:
     """Trains by `config` in `workdir`, going on where a checkpoint there left off.
 
     Writes `checkpoints/`, `metrics.jsonl` (a line each time something is measured),
-    `weights.safetensors` (the averaged weights of the best validation so far), and at the end
-    `summary.html`. Returns the best validation. Raises ValueError where config, data or
-    checkpoints cannot be used, `Diverged` where gradients stay infinite, and OSError where nothing
-    can be written.
+    `weights.safetensors` (the averaged weights of the best validation so far, those it began with
+    included where these were trained), and when it ends or is stopped `summary.html`. Returns the
+    best validation.
+
+    Raises ValueError where config, data or checkpoints cannot be used, `Diverged` where gradients
+    stay infinite, OSError where nothing can be written, and `Stopped` after SIGINT or SIGTERM, once
+    all is saved.
     """
-    chosen, mesh = learner(config), devices.make_mesh()
-    phases = [Phase(**phase) for phase in config.phases]
-    samplings = [_sampling(config, phase) for phase in phases]
-    for phase in phases:
-        devices.check_batch(phase.batch, config.train.pairs_at_once, mesh)
-        if phase.batch % jax.process_count():
-            raise ValueError(f"batch: got {phase.batch}, wanted a multiple of the processes")
-    if config.train.precision not in step.PRECISIONS:
-        raise ValueError(
-            f"precision: got {config.train.precision!r}, wanted one of {', '.join(step.PRECISIONS)}"
-        )
+    if workdir.exists() and not workdir.is_dir():
+        raise ValueError(f"workdir: {workdir} is a file, wanted a folder")
     workdir.mkdir(parents=True, exist_ok=True)
-    mixture = sources.open_mixture(config.data.train, workdir, "data.train")
-    held_out = sources.open_mixture(config.data.validation, workdir, "data.validation")
-    sources.check_apart(mixture, held_out)
-    pairs = sources.fixed_pairs(
-        held_out,
-        config.validation_pairs,
-        phases[-1].points,
-        chosen.validated.neighbors,
-        chosen.validated.radius,
+    task = prepare(config, workdir)
+    state = devices.replicate(
+        step.init_state(fresh_params(config, task.learner), task.optimizer), task.mesh
     )
-    placed = validation.place(pairs, mesh)
-    total = sum(phase.steps for phase in phases)
-    schedule = optimizers.make_schedule(
-        config.train.schedule,
-        peak_rate=config.train.peak_rate,
-        steps=total,
-        warmup=config.train.warmup,
-        cooldown=config.train.cooldown,
-    )
-    optimizer = optimizers.make_optimizer(
-        config.train.optimizer,
-        schedule,
-        clip=config.train.clip,
-        weight_decay=config.train.weight_decay,
-    )
-    if config.train.start_from:
-        params = weights.load_params(config.train.start_from, config.network)
-    else:
-        params = jax.jit(chosen.fresh)(jax.random.key(config.seed))
-    state = devices.replicate(step.init_state(params, optimizer), mesh)
-    about = _about(config)
+    about, told = record.begin(config, task.stamps), list(task.told)
     with Checkpoints(workdir / "checkpoints", keep=config.keep_checkpoints) as checkpoints:
         restored = checkpoints.restore(state)
         if restored is not None:
             state, before = restored
-            _warn_of_changes(before["config"], about["config"])
-            about |= {key: before[key] for key in ("best", "validation", "position", "clock")}
-        done = int(state.step)
-        reports = Reports(workdir, total, done, about["clock"], schedule, pairs)
-        for phase, ran in remaining(phases, done):
-            recipe = step.Recipe(
-                unroll=chosen.unroll,
-                settings=chosen.trained(phase.neighbors),
-                optimizer=optimizer,
-                mesh=mesh,
-                correspondence_weight=config.train.correspondence_weight,
-                average_decay=config.train.average_decay,
-                pairs_at_once=config.train.pairs_at_once,
-                precision=config.train.precision,
-            )
-            stream = batches(
-                mixture,
-                samplings[phases.index(phase)],
-                size=phase.batch,
-                position=about["position"],
-                count=phase.steps - ran,
-                seed=config.seed,
-                workers=config.train.workers,
-                share=devices.share_of(phase.batch),
-            )
-            reports.resume()
-            for batch in stream:
-                state, measured = step.train_step(state, devices.spread(batch, mesh), recipe=recipe)
-                done, about["position"] = done + 1, about["position"] + phase.batch
-                reports.step(done, measured)
-                if done % config.log_every == 0:
-                    reports.measured(done, int(state.skipped))
-                    _stop_if_diverged(int(state.skipped_in_row), done, config.train.max_skipped)
-                validating = done % config.validate_every == 0 or done == total
-                if validating:
-                    reports.pause()
-                    found = validation.validate(
-                        chosen, state.average, placed, pairs["transform"], mesh
-                    )
-                    reports.validated(done, found)
-                    del found["transforms"]
-                    about["validation"] = {"step": done, **found}
-                    if found["rotation_mean"] < about["best"].get("rotation_mean", np.inf):
-                        about["best"] = about["validation"]
-                        if devices.is_first():
-                            weights.save_params(
-                                workdir / "weights.safetensors",
-                                state.average,
-                                _notes(config, about),
-                            )
-                    reports.resume()
-                if validating or done % config.checkpoint_every == 0:
-                    about |= {"clock": reports.clock.read(), "skipped": int(state.skipped)}
-                    checkpoints.save(state, about | {"step": done}, best=about["best"].get("step"))
-        about |= {"clock": reports.clock.read(), "skipped": int(state.skipped)}
-        reports.close(about | {"step": done})
+            told += record.go_on(before, about, task.steps, workdir)
+        with Reports(workdir, task, about) as reports:
+            for line in told:
+                reports.say(line)
+            _Training(config, workdir, task, state, about, checkpoints, reports).go_to_the_end()
     return about["best"]
 
 
-class Diverged(ValueError):
-    """Too many steps in a row had a gradient that is not finite."""
+@dataclasses.dataclass
+class _Training:
+    """A run from its start, or from a checkpoint, to its end; `about` tells where it is."""
+
+    config: Any
+    workdir: Path
+    task: Task
+    state: TrainState
+    about: dict
+    checkpoints: Checkpoints
+    reports: Reports
+
+    def __post_init__(self):
+        self._placed = validation.place(self.task.pairs, self.task.mesh)
+
+    def go_to_the_end(self) -> None:
+        if self.config.train.start_from and self.about["step"] == 0:
+            self._validate()
+        with stopping.stop_requests() as requests:
+            for phase, ran in remaining(self.task.phases, self.about["step"]):
+                self._go_through(phase, ran, requests)
+        self._take_note()
+
+    def _go_through(self, phase: Phase, ran: int, requests: stopping.Requests) -> None:
+        config, task, about = self.config, self.task, self.about
+        recipe = step.Recipe(
+            unroll=task.learner.unroll,
+            settings=task.learner.trained(phase.neighbors),
+            optimizer=task.optimizer,
+            mesh=task.mesh,
+            correspondence_weight=config.train.correspondence_weight,
+            average_decay=config.train.average_decay,
+            pairs_at_once=config.train.pairs_at_once,
+            precision=config.train.precision,
+        )
+        stream = batches(
+            task.mixture,
+            task.samplings[task.phases.index(phase)],
+            size=phase.batch,
+            position=about["position"],
+            count=phase.steps - ran,
+            seed=config.seed,
+            workers=config.train.workers,
+            share=devices.share_of(phase.batch),
+        )
+        self.reports.begin(phase)
+        for batch in stream:
+            self.state, measured = step.train_step(
+                self.state, devices.spread(batch, task.mesh), recipe=recipe
+            )
+            done = about["step"] = about["step"] + 1
+            about["position"] += phase.batch
+            self.reports.step(done, measured)
+            if done % config.log_every == 0:
+                self.reports.measured(done, int(self.state.skipped))
+                _stop_if_diverged(int(self.state.skipped_in_row), done, config.train.max_skipped)
+            validating = done % config.validate_every == 0 or done == task.steps
+            if validating:
+                self._validate()
+            if validating or done % config.checkpoint_every == 0 or requests.received:
+                self._take_note()
+                self.checkpoints.save(self.state, about.copy(), best=about["best"].get("step"))
+            if requests.received:
+                self.checkpoints.wait()
+                raise stopping.Stopped(
+                    f"stopped at step {done} of {task.steps}, all saved; "
+                    "the same command goes on from there",
+                    requests.received,
+                )
+
+    def _validate(self) -> None:
+        task, about = self.task, self.about
+        self.reports.pause()
+        found = validation.validate(
+            task.learner, self.state.average, self._placed, task.pairs["transform"], task.mesh
+        )
+        self.reports.validated(about["step"], found)
+        del found["transforms"]
+        about["validation"] = {"step": about["step"], **found}
+        if found["rotation_mean"] < about["best"].get("rotation_mean", np.inf):
+            about["best"] = about["validation"]
+            if devices.is_first():
+                notes = record.notes(self.config, about)
+                weights.save_params(self.workdir / WEIGHTS, self.state.average, notes)
+        self.reports.resume()
+
+    def _take_note(self) -> None:
+        self.about |= {"clock": self.reports.clock.read(), "skipped": int(self.state.skipped)}
 
 
 def _stop_if_diverged(in_row: int, done: int, most: int) -> None:
@@ -150,43 +153,3 @@ def _stop_if_diverged(in_row: int, done: int, most: int) -> None:
             f"train.max_skipped = {most}; the last checkpoint holds the last sound weights.\n"
             "Try a lower train.peak_rate or train.clip, and look for broken shapes in the data"
         )
-
-
-def _sampling(config, phase):
-    return Sampling(points=phase.points, neighbors=phase.neighbors, **config.sampling.to_dict())
-
-
-def _about(config) -> dict:
-    """What a checkpoint says of itself, before the first step."""
-    versions = {name: importlib.metadata.version(name) for name in _NAMED}
-    versions |= {"cfr_jax": __version__, "python": platform.python_version()}
-    return {
-        "best": {},
-        "validation": {},  # the last one
-        "position": 0,  # pairs of the stream that were used; with the seed it decides all others
-        "random_key": np.asarray(jax.random.key_data(jax.random.key(config.seed))).tolist(),
-        "skipped": 0,
-        "clock": {"seconds": 0.0, "processor_seconds": 0.0},
-        "config": json.loads(json.dumps(config.to_dict())),
-        "versions": versions,
-        "started": time.strftime("%Y-%m-%d %H:%M:%S %z"),
-    }
-
-
-def _warn_of_changes(before: dict, now: dict) -> None:
-    changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
-    if changed:
-        warnings.warn(
-            f"the config differs from the checkpoint's in {', '.join(changed)}: going on by the "
-            "new one",
-            stacklevel=3,
-        )
-
-
-def _notes(config, about) -> dict[str, str]:
-    """What the weights file says of its own making."""
-    return {
-        "config": json.dumps(config.to_dict(), sort_keys=True),
-        "validation": json.dumps(about["best"]),
-        "made_by": f"cfr_jax {__version__} train.py",
-    }

@@ -7,13 +7,16 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import optax
 
 from cfr_jax.losses import PairLoss
 from cfr_jax.training.board import Board
 from cfr_jax.training.devices import is_first
+from cfr_jax.training.learner import Phase
 from cfr_jax.training.log import Bar, Clock, Journal, read_journal, summarize
+from cfr_jax.training.stopping import Stopped
 from cfr_jax.training.summary import write_summary
+from cfr_jax.training.task import Task
+from cfr_jax.training.validation import in_words
 from cfr_jax.viewer.scene import Scene
 
 _PICTURES = 3  # validation pairs drawn for TensorBoard
@@ -26,29 +29,48 @@ class Reports:
     and `resume`.
     """
 
-    def __init__(
-        self,
-        workdir: Path,
-        total: int,
-        step: int,
-        used: dict[str, float],
-        schedule: optax.Schedule,
-        pairs: dict,
-    ):
-        self.clock = Clock(**used)
-        self._workdir, self._schedule, self._pairs = workdir, schedule, pairs
+    def __init__(self, workdir: Path, task: Task, about: dict):
+        self.clock = Clock(**about["clock"])
+        self._workdir, self._task, self._about = workdir, task, about
         self._waiting: list[PairLoss] = []
         self._written = self.clock.read()["seconds"]
-        self._bar = Bar(total, step, shown=is_first())
+        self._compiling = False
+        self._bar = Bar(task.steps, about["step"], shown=is_first())
         self._journal = self._board = None
         if is_first():
-            self._journal = Journal(workdir / "metrics.jsonl", step)
-            self._board = Board(workdir / "tensorboard", step)
+            self._journal = Journal(workdir / "metrics.jsonl", about["step"])
+            self._board = Board(workdir / "tensorboard", about["step"])
             if self._board.missing:
                 self._bar.say(self._board.missing)
 
+    def __enter__(self) -> Reports:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Ends the bar, and writes the page unless something is wrong."""
+        self._bar.close()
+        if self._journal is not None and self._board is not None:
+            self._board.close()
+            if kind is None or issubclass(kind, Stopped):
+                lines = read_journal(self._journal.path)
+                write_summary(self._workdir / "summary.html", lines, self._about)
+
+    def say(self, text: str) -> None:
+        """A line above the bar."""
+        self._bar.say(text)
+
+    def begin(self, phase: Phase) -> None:
+        """Counts time from here on; the first step of a phase is compiled first."""
+        self._bar.say(
+            f"{phase.steps} steps of {phase.batch} pairs, {phase.points} points, "
+            f"{phase.neighbors} neighbors: compiling, up to a minute"
+        )
+        self._compiling = True
+        self.resume()
+
     def resume(self) -> None:
         """Counts time again."""
+        self._bar.forget_time()
         self.clock.start()
 
     def pause(self) -> None:
@@ -63,6 +85,9 @@ class Reports:
         if self._waiting:
             jax.block_until_ready(self._waiting[-1].total)
         self._waiting.append(measured)
+        if self._compiling:
+            self._bar.forget_time()
+        self._compiling = False
         self._bar.step(done)
 
     def measured(self, done: int, skipped: int) -> None:
@@ -71,7 +96,7 @@ class Reports:
         line = {
             "step": done,
             **summarize(self._waiting),
-            "learning_rate": float(self._schedule(np.int32(done - 1))),
+            "learning_rate": float(self._task.schedule(np.int32(done - 1))),
             "steps_per_second": steps / max(used["seconds"] - self._written, 1e-9),
             # all of a training, over its restarts, without validations
             "training_seconds": used["seconds"],
@@ -91,18 +116,7 @@ class Reports:
         if self._journal is not None and self._board is not None:
             self._journal.write({"step": done, "validation": shown})
             self._board.validation(done, shown, self._scenes(found["transforms"]))
-        self._bar.say(
-            f"step {done}: validation RE {found['rotation_mean']:.2f} mean, "
-            f"{found['rotation_median']:.2f} median, recall {found['recall_5deg_0.1']:.2f}"
-        )
-
-    def close(self, about: dict) -> None:
-        """Ends the bar and writes the page; `about` is what the last checkpoint says."""
-        self._bar.close()
-        if self._journal is not None and self._board is not None:
-            self._board.close()
-            lines = read_journal(self._journal.path)
-            write_summary(self._workdir / "summary.html", lines, about)
+        self._bar.say(f"step {done}: {in_words(found)}")
 
     def _scenes(self, transforms: np.ndarray) -> list[tuple[str, Scene]]:
         scenes = []
@@ -110,6 +124,6 @@ class Reports:
             stations = np.concatenate([np.eye(4)[None], transforms[row]])
             if np.isfinite(stations).all():
                 labels = ["start", *(str(i) for i in range(1, len(stations)))]
-                clouds = self._pairs["source"][row], self._pairs["target"][row]
+                clouds = self._task.pairs["source"][row], self._task.pairs["target"][row]
                 scenes.append((f"pair_{row}", Scene(*clouds, stations, labels)))
         return scenes

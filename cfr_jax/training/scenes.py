@@ -7,10 +7,10 @@ the unit sphere, thinned evenly. Scans without normals have them estimated.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Hashable
+import hashlib
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,8 @@ from jaxtyping import Float
 from cfr_jax import io, preparation
 from cfr_jax.data import kitti
 from cfr_jax.data.augment import Sampling, View, choose_rows, finish_pair
-from cfr_jax.data.pairs import Hdf5Pairs, Pair, among, open_pairs
+from cfr_jax.data.layout import CLOUD_SUFFIXES, loose_files, scans_of
+from cfr_jax.data.pairs import CsvPairs, Hdf5Pairs, Pair, among, open_pairs
 from cfr_jax.data.protocol import crop
 
 _HELD = 256  # pairs in memory: reading one takes longer than drawing from it
@@ -28,11 +29,17 @@ Frames = tuple[int, int] | None
 
 @dataclass(frozen=True, eq=False)
 class SceneSource:
-    """Scans in pairs; `frames[i]` names what item `i` was recorded from."""
+    """Scans in pairs; `frames[i]` names what item `i` was recorded from.
+
+    `single`: both clouds of an item are one scan, of which views are to be drawn. `stamp` changes
+    with the names and sizes of the files.
+    """
 
     names: tuple[str, ...]
     frames: tuple[tuple[Hashable, ...], ...]
     read: Callable[[int], Pair]
+    stamp: str
+    single: bool = False
 
     def __len__(self) -> int:
         return len(self.names)
@@ -66,19 +73,27 @@ def pairs_source(path: str | Path, frames: Frames = None) -> SceneSource:
     `frames` goes by the attributes `source_frame` and `target_frame` of the groups of HDF5.
     """
     held = open_pairs(path)
-    tokens: tuple[tuple[Any, ...], ...]
+    where = str(Path(path).resolve())
+    files = [Path(path)]
+    recorded: list[tuple[Hashable, ...]]
+    numbers: list[tuple[int | str, int | str]]
     if isinstance(held, Hdf5Pairs):
-        tokens = tuple(held.frames(i) for i in range(len(held)))
+        numbers = [held.frames(i) for i in range(len(held))]
+        recorded = [tuple((where, frame) for frame in pair) for pair in numbers]
     else:
-        tokens = tuple(tuple(name.split(" -> ")) for name in held.names)
-    rows = range(len(held))
+        assert isinstance(held, CsvPairs)  # there is no third form
+        numbers = list(held.listed)
+        places = [[(held.path.parent / name).resolve() for name in pair] for pair in held.listed]
+        recorded = [tuple((str(place),) for place in pair) for pair in places]
+        files += sorted({place for pair in places for place in pair})
+    rows: Sequence[int] = range(len(held))
     if frames is not None:
-        if any(not isinstance(token, int) for pair in tokens for token in pair):
+        if any(not isinstance(number, int) for pair in numbers for number in pair):
             raise ValueError(
                 f"frames: {path} does not say from which frames its pairs are; "
                 "make a list of pairs for training and another for validation"
             )
-        rows = [i for i in rows if among(frames, tokens[i])]
+        rows = [i for i in rows if among(frames, numbers[i])]
 
     def read(row: int) -> Pair:
         pair = held[rows[row]]
@@ -86,13 +101,7 @@ def pairs_source(path: str | Path, frames: Frames = None) -> SceneSource:
             raise ValueError(f"{path}: {pair.name} has no true transform to learn from")
         return pair
 
-    where = str(Path(path).resolve())
-    return _checked(
-        path,
-        tuple(held.names[i] for i in rows),
-        tuple(tuple((where, token) for token in tokens[i]) for i in rows),
-        read,
-    )
+    return _source(path, [held.names[i] for i in rows], [recorded[i] for i in rows], read, files)
 
 
 def kitti_source(
@@ -124,34 +133,41 @@ def kitti_source(
         return Pair(f"{sequence}/{a:06d}-{b:06d}", *clouds, transform=transform)
 
     where = str(Path(path).resolve())
-    return _checked(
+    return _source(
         path,
-        tuple(f"{sequence}/{a:06d}-{b:06d}" for sequence, a, b, _ in items),
-        tuple(((where, sequence, a), (where, sequence, b)) for sequence, a, b, _ in items),
+        [f"{sequence}/{a:06d}-{b:06d}" for sequence, a, b, _ in items],
+        [((where, sequence, a), (where, sequence, b)) for sequence, a, b, _ in items],
         read,
+        [file for sequence in sequences for file in scans_of(Path(path))[sequence]],
     )
 
 
 def scans_source(path: str | Path) -> SceneSource:
-    """Both clouds are views of one scan: every file of a folder that `cfr_jax.io` reads."""
+    """Both clouds are views of one scan: every file below a folder whose suffix `cfr_jax.io` reads,
+    but for hidden ones."""
     folder = Path(path)
     if not folder.is_dir():
         raise ValueError(f"no folder of scans at {folder}")
-    files = sorted(p for p in folder.rglob("*") if p.is_file() and not p.name.startswith("."))
+    files = loose_files(folder, CLOUD_SUFFIXES)
 
     def read(row: int) -> Pair:
         scan = io.read(files[row])
         clouds = scan.points, scan.points, scan.normals, scan.normals
         return Pair(files[row].name, *clouds, transform=np.eye(4))
 
-    names = tuple(file.relative_to(folder).as_posix() for file in files)
-    return _checked(path, names, tuple(((str(file.resolve()),),) for file in files), read)
+    names = [file.relative_to(folder).as_posix() for file in files]
+    recorded = [((str(file.resolve()),),) for file in files]
+    return _source(path, names, recorded, read, files, single=True)
 
 
-def _checked(path, names, frames, read):
+def _source(path, names, frames, read, files, single=False):
     if not names:
-        raise ValueError(f"{path}: no pair of scans there, or none within `frames`")
-    return SceneSource(names, frames, functools.lru_cache(_HELD)(read))
+        wanted = " ".join(CLOUD_SUFFIXES) if single else "pairs, and some within `frames`"
+        raise ValueError(f"{path}: no scan to train on there; wanted {wanted}")
+    sizes = [file.stat().st_size if file.is_file() else -1 for file in files]
+    stamp = hashlib.sha256(repr((list(names), sizes)).encode()).hexdigest()
+    held = functools.lru_cache(_HELD)(read)
+    return SceneSource(tuple(names), tuple(frames), held, stamp, single)
 
 
 def _view(

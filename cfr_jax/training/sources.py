@@ -8,6 +8,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,13 +17,17 @@ from typing import Any
 import ml_collections
 import numpy as np
 
+from cfr_jax.atomic import write_atomically
 from cfr_jax.data import protocol
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.batches import Mixture, ShapeSource, Source
 from cfr_jax.data.corpus import read_corpus
 from cfr_jax.neighbors import nearest_on_host
+from cfr_jax.progress import Progress
 from cfr_jax.training import scenes
+from cfr_jax.training.devices import is_first
 
+_TOLD = 10  # scans that cannot be read, by name
 KINDS = ("shapes", "pairs", "kitti", "scans")
 
 
@@ -63,43 +69,109 @@ def check_apart(train: Mixture, validation: Mixture) -> None:
         )
 
 
-def fixed_pairs(mixture: Mixture, count: int, points: int, neighbors: int, radius: float) -> dict:
+def check_readable(mixture: Mixture, cache: Path, where: str) -> None:
+    """Reads every scan once, before a training would come upon a bad one in its third hour.
+
+    What was found sound is remembered in the folder `cache`. Raises ValueError with all that cannot
+    be read.
+    """
+    known = cache / "readable"
+    sound = set(known.read_text("utf-8").split()) if known.is_file() else set()
+    scans = [source for source in mixture.sources if isinstance(source, scenes.SceneSource)]
+    for source in scans:
+        if source.stamp in sound:
+            continue
+        wrong = []
+        for row in Progress(range(len(source)), desc=f"reading {where}", unit=" pairs"):
+            try:
+                source.read(row)
+            except ValueError as error:
+                wrong.append(str(error))
+        if wrong:
+            wrong = list(dict.fromkeys(wrong))
+            more = f"\n... and {len(wrong) - _TOLD} more" if len(wrong) > _TOLD else ""
+            raise ValueError(
+                f"{where}: {len(wrong)} scans cannot be used; mend them or take them out:\n"
+                + "\n".join(wrong[:_TOLD])
+                + more
+            )
+        sound.add(source.stamp)
+    if scans and is_first():
+        write_atomically(known, "\n".join(sorted(sound)).encode())
+
+
+def stamp(mixture: Mixture, *more: np.ndarray) -> str:
+    """What tells data from other data, wherever they lie; of `more`, four decimals."""
+    parts = [
+        source.stamp if isinstance(source, scenes.SceneSource) else _shapes_stamp(source)
+        for source in mixture.sources
+    ]
+    parts += [f"{np.round(array.astype(np.float64), 4).tolist()}" for array in more]
+    text = "\n".join([*parts, str(list(mixture.repeats))])
+    return f"{told(mixture)}, {hashlib.sha256(text.encode()).hexdigest()[:12]}"
+
+
+def told(mixture: Mixture) -> str:
+    """How many pairs of what kind, in words."""
+    kinds: Counter[str] = Counter()
+    for source, repeat in zip(mixture.sources, mixture.repeats, strict=True):
+        kind = "shapes"
+        if isinstance(source, scenes.SceneSource):
+            kind = "single scans" if source.single else "pairs of scans"
+        kinds[kind] += repeat * len(source)
+    return " and ".join(f"{count} {kind}" for kind, count in kinds.items())
+
+
+def fixed_pairs(mixture: Mixture, count: int, sampling: Sampling) -> dict:
     """The same `count` pairs every time, spread over the sources, as one batch.
 
-    Shapes by the fixed partial protocol, 717 points; scans whole, at `points` points and up to 45
-    degrees about each axis. One batch holds clouds of one size: either shapes or scans.
+    Shapes by the fixed partial protocol, 717 points. Recorded pairs as they are, thinned to
+    `sampling.points` and turned by up to 45 degrees about each axis. Of a single scan two views are
+    drawn by `sampling`, as in training: whole, it would be laid on itself. One batch holds clouds
+    of one size: either shapes or scans.
     """
-    sampling = None
-    if any(not isinstance(source, ShapeSource) for source in mixture.sources):
-        sampling = Sampling(
-            points=points,
-            neighbors=min(neighbors, points - 1),
-            radius=radius,
-            keep=(1.0, 1.0),
-            translation=0.1,
-            noise=(0.0, 0.0),
-        )
-        if any(isinstance(source, ShapeSource) for source in mixture.sources):
-            raise ValueError("data.validation: mixes shapes with scans, wanted either")
+    shapes = [isinstance(source, ShapeSource) for source in mixture.sources]
+    if any(shapes) and not all(shapes):
+        raise ValueError("data.validation: mixes shapes with scans, wanted either")
+    recorded = Sampling(
+        points=sampling.points,
+        neighbors=sampling.neighbors,
+        radius=sampling.radius,
+        keep=(1.0, 1.0),
+        translation=0.1,
+        noise=(0.0, 0.0),
+    )
     whole = Mixture(mixture.sources, [1] * len(mixture.sources))
     chosen = np.linspace(0, len(whole) - 1, min(count, len(whole))).astype(int)
     pairs = []
     for index in chosen.tolist():
-        if sampling is None:
-            pairs.append(_protocol_pair(*whole.locate(index), neighbors, radius))
+        source, row = whole.locate(index)
+        if isinstance(source, ShapeSource):
+            pairs.append(_protocol_pair(source, row, sampling))
         else:
-            pairs.append(whole.draw(index, sampling, np.random.default_rng(index)))
+            views = isinstance(source, scenes.SceneSource) and source.single
+            drawn = sampling if views else recorded
+            pairs.append(source.draw(row, drawn, np.random.default_rng(index)))
     return {key: np.stack([pair[key] for pair in pairs]) for key in pairs[0]}
 
 
-def _protocol_pair(source: Any, index: int, neighbors: int, radius: float) -> dict:
+def _protocol_pair(source: ShapeSource, index: int, sampling: Sampling) -> dict:
     pair = protocol.fixed_pair(source.corpus, index, protocol.partial)
     made = {"transform": pair.transform, "estimate_normals": False}
     for side in ("source", "target"):
         cloud = made[side] = getattr(pair, side)
         made[f"{side}_normals"] = getattr(pair, f"{side}_normals")
-        made[f"{side}_neighbors"] = nearest_on_host(cloud, neighbors, radius=radius)
+        made[f"{side}_neighbors"] = nearest_on_host(
+            cloud, sampling.neighbors, radius=sampling.radius
+        )
     return made
+
+
+def _shapes_stamp(source):
+    corpus = source.corpus
+    digest = hashlib.sha256("\n".join(corpus.names).encode())
+    digest.update(corpus.points[:, ::64].tobytes())
+    return digest.hexdigest()
 
 
 def _named(given, where):
@@ -131,4 +203,9 @@ def _open(kind, about, cache, where):
             f"{where}: {kind} got {sorted(about)}, wanted path, and perhaps "
             f"{', '.join(sorted(allowed - {'path'})) or 'repeat'}"
         )
-    return makers[kind](about.pop("path"), **about)
+    path = about.pop("path")
+    if not str(path):
+        raise ValueError(
+            f"{where}.path: none given; wanted a file or a folder, as in --config.{where}.path=PATH"
+        )
+    return makers[kind](path, **about)

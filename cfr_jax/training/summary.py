@@ -19,6 +19,10 @@ figcaption { font-weight: 600; } svg { background: #fafbfc; border: 1px solid #e
 td, th { text-align: left; padding: .15rem 1.2rem .15rem 0; font-variant-numeric: tabular-nums; }
 pre { background: #fafbfc; border: 1px solid #e3e6ea; padding: .6rem; overflow-x: auto; }
 """
+_ANNEALING = {
+    "beta": "beta: how sharply affinities fall with the distance of the features",
+    "alpha": "alpha: the squared distance up to which points match",
+}
 Curve = tuple[str, Sequence[int], Sequence[float]]
 """A name, steps, values."""
 
@@ -33,6 +37,8 @@ def write_summary(path: Path, lines: Sequence[dict], about: dict) -> None:
     )
     best = about["best"]
     rows = {
+        "trained on": about["data"]["data.train"],
+        "validated on": about["data"]["data.validation"],
         "best validation": f"step {best['step']}" if best else "none",
         "rotation error, mean": _number(best.get("rotation_mean"), "°"),
         "rotation error, median": _number(best.get("rotation_median"), "°"),
@@ -72,7 +78,15 @@ def _figures(lines):
 
     iterations = range(len(training[-1]["beta"])) if training else ()
     return [
-        ("Loss", "", [of("all", "loss"), of("pose", "pose")]),
+        (
+            "Loss",
+            "",
+            [
+                of("all", "loss"),
+                of("motion and slack", "pose"),
+                of("correspondences, before their weight", "correspondence"),
+            ],
+        ),
         (
             "Rotation error",
             "degrees",
@@ -95,11 +109,11 @@ def _figures(lines):
         ("Speed", "steps/s", [of("speed", "steps_per_second")]),
         *(
             (
-                name,
+                title,
                 "",
                 [of(f"iteration {i + 1}", name, lambda value, i=i: value[i]) for i in iterations],
             )
-            for name in ("beta", "alpha")
+            for name, title in _ANNEALING.items()
         ),
     ]
 

@@ -38,3 +38,12 @@ def validate(chosen: Learner, params: dict, placed: dict, truth: np.ndarray, mes
         ],
         "transforms": transforms,
     }
+
+
+def in_words(found: dict) -> str:
+    """A validation, as people read it."""
+    return (
+        f"validation RE {found['rotation_mean']:.2f}° mean, "
+        f"{found['rotation_median']:.2f}° median, TE {found['translation_mean']:.3f}, "
+        f"recall (5°, 0.1) {found['recall_5deg_0.1']:.2f}"
+    )

@@ -1,0 +1,128 @@
+"""All that a config asks for, opened and checked before anything is compiled."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import optax
+from jax.sharding import Mesh
+
+from cfr_jax import weights
+from cfr_jax.data.augment import Sampling
+from cfr_jax.data.batches import Mixture
+from cfr_jax.training import devices, optimizers, sources, step
+from cfr_jax.training.learner import Learner, Phase, learner
+
+_FEW = 30  # validation pairs below which the best weights are a matter of chance
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Task:
+    """What is trained, on what, for how long, and what it is validated on."""
+
+    learner: Learner
+    mesh: Mesh
+    phases: tuple[Phase, ...]
+    samplings: tuple[Sampling, ...]
+    """One of each phase."""
+    mixture: Mixture
+    pairs: dict
+    """What is validated on, as one batch."""
+    schedule: optax.Schedule
+    optimizer: optax.GradientTransformation
+    stamps: dict[str, str]
+    """Of the training and of the validation data: other text, other data."""
+    told: tuple[str, ...]
+    """In words, for whoever watches."""
+
+    @property
+    def steps(self) -> int:
+        """Of all phases."""
+        return sum(phase.steps for phase in self.phases)
+
+
+def prepare(config: Any, workdir: Path) -> Task:
+    """The task of a config; refined truths, and that all scans can be read, are kept in `workdir`.
+
+    Raises ValueError, naming the field, where the config cannot be used, the data cannot be read,
+    or training and validation share a scan.
+    """
+    chosen, mesh = learner(config), devices.make_mesh()
+    phases = tuple(Phase(**phase) for phase in config.phases)
+    for phase in phases:
+        devices.check_batch(phase.batch, config.train.pairs_at_once, mesh)
+        if phase.batch % jax.process_count():
+            raise ValueError(f"batch: got {phase.batch}, wanted a multiple of the processes")
+    samplings = tuple(
+        Sampling(points=phase.points, neighbors=phase.neighbors, **config.sampling.to_dict())
+        for phase in phases
+    )
+    if config.train.precision not in step.PRECISIONS:
+        raise ValueError(
+            f"precision: got {config.train.precision!r}, wanted one of {', '.join(step.PRECISIONS)}"
+        )
+    if config.train.workers < 1:
+        raise ValueError(f"workers: got {config.train.workers}, wanted at least 1")
+    schedule = optimizers.make_schedule(
+        config.train.schedule,
+        peak_rate=config.train.peak_rate,
+        steps=sum(phase.steps for phase in phases),
+        warmup=config.train.warmup,
+        cooldown=config.train.cooldown,
+    )
+    optimizer = optimizers.make_optimizer(
+        config.train.optimizer,
+        schedule,
+        clip=config.train.clip,
+        weight_decay=config.train.weight_decay,
+    )
+    mixture = sources.open_mixture(config.data.train, workdir, "data.train")
+    held_out = sources.open_mixture(config.data.validation, workdir, "data.validation")
+    sources.check_apart(mixture, held_out)
+    sources.check_readable(mixture, workdir, "data.train")
+    sources.check_readable(held_out, workdir, "data.validation")
+    validated = dataclasses.replace(
+        samplings[-1],
+        neighbors=min(chosen.validated.neighbors, samplings[-1].points - 1),
+        radius=chosen.validated.radius,
+    )
+    pairs = sources.fixed_pairs(held_out, config.validation_pairs, validated)
+    return Task(
+        learner=chosen,
+        mesh=mesh,
+        phases=phases,
+        samplings=samplings,
+        mixture=mixture,
+        pairs=pairs,
+        schedule=schedule,
+        optimizer=optimizer,
+        stamps={
+            "data.train": sources.stamp(mixture),
+            "data.validation": sources.stamp(held_out, pairs["transform"]),
+        },
+        told=_told(config, mixture, held_out, len(pairs["transform"]), workdir),
+    )
+
+
+def fresh_params(config: Any, chosen: Learner) -> dict:
+    """The weights that a run begins with: those of `train.start_from`, or random ones."""
+    if config.train.start_from:
+        return weights.load_params(config.train.start_from, config.network)
+    return jax.jit(chosen.fresh)(jax.random.key(config.seed))
+
+
+def _told(config, mixture, held_out, count, workdir):
+    begun = config.train.start_from or "random numbers"
+    told = [
+        f"training on {sources.told(mixture)}, from {begun}; "
+        f"validated on {count} pairs of {sources.told(held_out)}; all of it goes to {workdir}"
+    ]
+    if count < _FEW:
+        told.append(
+            f"only {count} validation pairs: which weights are best is a matter of chance with "
+            f"fewer than {_FEW}"
+        )
+    return tuple(told)
