@@ -146,7 +146,8 @@ def test_a_shape_does_not_depend_on_the_others(meshes, tmp_path):
 def test_one_file_holds_all(meshes, tmp_path):
     report = make(meshes, tmp_path / "all.h5", unseen=None)
     assert len(read_corpus(tmp_path / "all.h5")) == report.shapes == 12
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["all.h5", "shape_names.txt"]
+    beside = ["all.h5", "all.left_out.txt", "shape_names.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == beside
 
 
 def test_meshes_without_folders_are_of_one_category(tmp_path):
