@@ -18,7 +18,8 @@ def get_config() -> ConfigDict:
     config.data.validation = "../shared/data/open_cad/val.h5"
 
     # Clouds grow as training goes on: small ones learn the most per second at first, and the
-    # weights depend neither on the points nor on the neighbors (docs/training.md).
+    # weights depend neither on the points nor on the neighbors (docs/training.md). A phase may
+    # have a `sampling` of its own: {..., "sampling": {"estimated_normals": 0.6}}.
     config.phases = (
         {"steps": 3000, "points": 256, "neighbors": 24, "batch": 8},
         {"steps": 4000, "points": 717, "neighbors": 32, "batch": 8},

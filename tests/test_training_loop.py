@@ -15,6 +15,7 @@ from cfr_jax.data.augment import Sampling
 from cfr_jax.training import devices, learner, loop, optimizers, step, validation
 from cfr_jax.training.checkpoints import Checkpoints, SaveError
 from cfr_jax.training.stopping import Stopped
+from cfr_jax.training.task import prepare
 
 
 @pytest.fixture(scope="module")
@@ -278,6 +279,22 @@ def test_what_a_config_has_wrong_is_named(corpus_file, tmp_path, change, wanted)
 
     with pytest.raises(ValueError, match=wanted), jax.numpy_dtype_promotion("standard"):
         loop.run(given, tmp_path)
+
+
+def test_a_phase_may_be_sampled_in_its_own_way(corpus_file, tmp_path):
+    given = config(corpus_file)
+    given.phases[1]["sampling"] = {"estimated_normals": 1.0}
+
+    first, second = prepare(given, tmp_path).samplings
+
+    assert (first.estimated_normals, second.estimated_normals) == (0.5, 1.0)
+    assert first.keep == second.keep == (0.7, 0.7)
+    given.phases[1]["sampling"] = {"estimated": 1.0}
+    with pytest.raises(ValueError, match="sampling: .*'estimated'"):
+        prepare(given, tmp_path)
+    given.phases[0]["step"] = 3
+    with pytest.raises(ValueError, match="phases: .*'step'"):
+        prepare(given, tmp_path)
 
 
 def test_validation_measures_the_last_transform(corpus_file, monkeypatch):

@@ -33,6 +33,8 @@ class Phase:
     points: int
     neighbors: int
     batch: int
+    sampling: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Fields of `data.augment.Sampling` that differ from the config's in this phase."""
 
 
 def learner(config: Any) -> Learner:

@@ -51,13 +51,19 @@ def prepare(config: Any, workdir: Path) -> Task:
     or training and validation share a scan.
     """
     chosen, mesh = learner(config), devices.make_mesh()
-    phases = tuple(Phase(**phase) for phase in config.phases)
+    phases = tuple(_made(Phase, dict(phase), "phases") for phase in config.phases)
     for phase in phases:
         devices.check_batch(phase.batch, config.train.pairs_at_once, mesh)
         if phase.batch % jax.process_count():
             raise ValueError(f"batch: got {phase.batch}, wanted a multiple of the processes")
     samplings = tuple(
-        Sampling(points=phase.points, neighbors=phase.neighbors, **config.sampling.to_dict())
+        _made(
+            Sampling,
+            {"points": phase.points, "neighbors": phase.neighbors}
+            | config.sampling.to_dict()
+            | phase.sampling,
+            "sampling",
+        )
         for phase in phases
     )
     if config.train.precision not in step.PRECISIONS:
@@ -112,6 +118,14 @@ def fresh_params(config: Any, chosen: Learner) -> dict:
     if config.train.start_from:
         return weights.load_params(config.train.start_from, config.network)
     return jax.jit(chosen.fresh)(jax.random.key(config.seed))
+
+
+def _made(kind, fields, where):
+    """What a config file describes by `fields`; one of its author's own may have others."""
+    try:
+        return kind(**fields)
+    except TypeError as error:
+        raise ValueError(f"{where}: {error}") from error
 
 
 def _told(config, mixture, held_out, count, workdir):
