@@ -71,6 +71,19 @@ def killed_in_step(monkeypatch):
     return arrange
 
 
+@pytest.fixture
+def killed_config(killed_in_step, corpus_file, tmp_path):
+    """Kills a run in `tmp_path` in the step with this number; its config, to go on with."""
+
+    def arrange(number):
+        killed_in_step(number)
+        with pytest.raises(Killed):
+            run(config(corpus_file), tmp_path)
+        return config(corpus_file)
+
+    return arrange
+
+
 def test_an_interrupted_run_resumes_bit_for_bit(corpus_file, tmp_path, whole, killed_in_step):
     begun = killed_in_step(11)
     with pytest.raises(Killed):
@@ -138,11 +151,8 @@ def test_a_checkpoint_says_all_that_a_run_needs(whole):
     assert about["clock"]["seconds"] > 0 and about["clock"]["processor_seconds"] > 0
 
 
-def test_another_config_goes_on_with_a_word(corpus_file, tmp_path, killed_in_step, capsys):
-    killed_in_step(6)
-    with pytest.raises(Killed):
-        run(config(corpus_file), tmp_path)
-    changed = config(corpus_file)
+def test_another_config_goes_on_with_a_word(killed_config, tmp_path, capsys):
+    changed = killed_config(6)
     changed.keep_checkpoints = 3
     capsys.readouterr()
 
@@ -160,11 +170,8 @@ def test_a_workdir_of_other_training_data_is_refused(tmp_path, whole):
         run(other, whole[0])
 
 
-def test_other_validation_pairs_forget_what_was_best(corpus_file, tmp_path, killed_in_step, capsys):
-    killed_in_step(6)
-    with pytest.raises(Killed):
-        run(config(corpus_file), tmp_path)
-    changed = config(corpus_file)
+def test_other_validation_pairs_forget_what_was_best(killed_config, tmp_path, capsys):
+    changed = killed_config(6)
     changed.validation_pairs = 3
 
     best = run(changed, tmp_path)
@@ -301,7 +308,7 @@ def test_validation_measures_the_last_transform(corpus_file, monkeypatch):
     from cfr_jax.training import sources
 
     held_out = sources.open_mixture(str(corpus_file), corpus_file.parent, "data.validation")
-    pairs = sources.fixed_pairs(held_out, 3, Sampling(points=100, neighbors=64))
+    pairs = sources.fixed_pairs(held_out, 3, Sampling(points=24, neighbors=6), 64, 0.3)
     assert pairs["source"].shape == (3, 717, 3)
     assert pairs["source_neighbors"].shape == (3, 717, 64)
     off = np.array(pairs["transform"], np.float32)[:, None].repeat(2, axis=1)

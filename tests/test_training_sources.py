@@ -182,7 +182,7 @@ def test_of_a_single_scan_two_views_are_validated_on_and_a_recorded_pair_as_it_i
 
     def shared(**about):
         held = sources.open_mixture(given(room=about), tmp_path, "data.validation")
-        pairs = sources.fixed_pairs(held, 1, sampling)
+        pairs = sources.fixed_pairs(held, 1, sampling, 20, 0.3)
         moved = pieces.move(pairs["transform"][0].astype(np.float64), pairs["source"][0])
         gap = np.linalg.norm(moved[:, None] - pairs["target"][0], axis=-1).min(axis=1)
         return (gap < 1e-3).mean()
@@ -269,8 +269,8 @@ def test_validation_pairs_are_the_same_every_time(pairs_file, tmp_path):
     about = {"kind": "pairs", "path": str(pairs_file), "repeat": 2}
     held = sources.open_mixture(given(room=about), tmp_path, "data.validation")
 
-    sampling = Sampling(points=40, neighbors=39, keep=(0.5, 0.5))
-    first, second = (sources.fixed_pairs(held, 10, sampling) for _ in range(2))
+    sampling = Sampling(points=40, neighbors=6, keep=(0.5, 0.5))
+    first, second = (sources.fixed_pairs(held, 10, sampling, 64, 0.3) for _ in range(2))
 
     assert first["source"].shape == (6, 40, 3) and first["source_neighbors"].shape == (6, 40, 39)
     for key in first:

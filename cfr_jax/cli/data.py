@@ -49,8 +49,6 @@ What FILE is, told by its layout, and what a corpus holds: shapes by category, p
 corpus is an HDF5 file in the layout of modelnet40_ply_hdf5_2048, or a folder of them.
 """
 
-_ENOUGH = 30  # shapes to validate on
-
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
     """Adds `cfr data` with its own commands."""
@@ -205,9 +203,11 @@ def _print_report(report: Report, out: Path) -> None:
     for split, counts in report.counts.items():
         categories = sum(count > 0 for count in counts.values())
         print(f"{split:11s} {sum(counts.values())} shapes of {categories} categories")
-    few = sum(report.counts["val"].values()) if "val" in report.counts else _ENOUGH
-    if few < _ENOUGH:
-        print(f"few         {few} shapes to validate on: with fewer than {_ENOUGH}, which weights")
+    from cfr_jax.data.build import ENOUGH
+
+    few = sum(report.counts["val"].values()) if "val" in report.counts else ENOUGH
+    if few < ENOUGH:
+        print(f"few         {few} shapes to validate on: with fewer than {ENOUGH}, which weights")
         print("            are best is a matter of chance; more meshes, or another --unseen")
     for why, count in report.reasons.most_common():
         print(f"left out    {count}: {why}")

@@ -23,6 +23,7 @@ from cfr_jax.data.shapes import Shape, name_share
 from cfr_jax.progress import Progress
 
 VALIDATION_SHARE = 0.2
+ENOUGH = 30  # to validate on: with fewer, which weights are best is a matter of chance
 SPLITS = ("train", "val", "test")
 
 

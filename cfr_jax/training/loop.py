@@ -17,8 +17,6 @@ from cfr_jax.training.reports import Reports
 from cfr_jax.training.step import TrainState
 from cfr_jax.training.task import Task, fresh_params, prepare
 
-WEIGHTS = "weights.safetensors"
-
 
 class Diverged(ValueError):
     """Too many steps in a row had a gradient that is not finite."""
@@ -139,7 +137,7 @@ class _Training:
             about["best"] = about["validation"]
             if devices.is_first():
                 notes = record.notes(self.config, about)
-                weights.save_params(self.workdir / WEIGHTS, self.state.average, notes)
+                weights.save_params(self.workdir / record.WEIGHTS, self.state.average, notes)
         self.reports.resume()
 
     def _take_note(self) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from cfr_jax import __version__
 
 _NAMED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+WEIGHTS = "weights.safetensors"  # the best so far
 _KEPT = ("step", "best", "validation", "position", "clock", "skipped")
 
 
@@ -49,7 +50,7 @@ def go_on(before: dict, now: dict, total: int, workdir: Path) -> list[str]:
         raise ValueError(
             f"{workdir} holds a training on other data.train (then {before['data']['data.train']}, "
             f"now {now['data']['data.train']}); wanted another --workdir. To begin there with the "
-            f"weights of this one: --config.train.start_from={workdir / 'weights.safetensors'}"
+            f"weights of this one: --config.train.start_from={workdir / WEIGHTS}"
         )
     now |= {key: before[key] for key in _KEPT}
     done = now["step"]

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections import Counter
 from collections.abc import Callable
@@ -78,9 +79,8 @@ def check_readable(mixture: Mixture, cache: Path, where: str) -> None:
     known = cache / "readable"
     sound = set(known.read_text("utf-8").split()) if known.is_file() else set()
     scans = [source for source in mixture.sources if isinstance(source, scenes.SceneSource)]
-    for source in scans:
-        if source.stamp in sound:
-            continue
+    unread = [source for source in scans if source.stamp not in sound]
+    for source in unread:
         wrong = []
         for row in Progress(range(len(source)), desc=f"reading {where}", unit=" pairs"):
             try:
@@ -96,7 +96,7 @@ def check_readable(mixture: Mixture, cache: Path, where: str) -> None:
                 + more
             )
         sound.add(source.stamp)
-    if scans and is_first():
+    if unread and is_first():
         write_atomically(known, "\n".join(sorted(sound)).encode())
 
 
@@ -122,7 +122,9 @@ def told(mixture: Mixture) -> str:
     return " and ".join(f"{count} {kind}" for kind, count in kinds.items())
 
 
-def fixed_pairs(mixture: Mixture, count: int, sampling: Sampling) -> dict:
+def fixed_pairs(
+    mixture: Mixture, count: int, sampling: Sampling, neighbors: int, radius: float
+) -> dict:
     """The same `count` pairs every time, spread over the sources, as one batch.
 
     Shapes by the fixed partial protocol, 717 points. Recorded pairs as they are, thinned to
@@ -133,10 +135,12 @@ def fixed_pairs(mixture: Mixture, count: int, sampling: Sampling) -> dict:
     shapes = [isinstance(source, ShapeSource) for source in mixture.sources]
     if any(shapes) and not all(shapes):
         raise ValueError("data.validation: mixes shapes with scans, wanted either")
+    fewer = min(neighbors, sampling.points - 1)
+    views = dataclasses.replace(sampling, neighbors=fewer, radius=radius)
     recorded = Sampling(
         points=sampling.points,
-        neighbors=sampling.neighbors,
-        radius=sampling.radius,
+        neighbors=fewer,
+        radius=radius,
         keep=(1.0, 1.0),
         translation=0.1,
         noise=(0.0, 0.0),
@@ -147,23 +151,21 @@ def fixed_pairs(mixture: Mixture, count: int, sampling: Sampling) -> dict:
     for index in chosen.tolist():
         source, row = whole.locate(index)
         if isinstance(source, ShapeSource):
-            pairs.append(_protocol_pair(source, row, sampling))
+            pairs.append(_protocol_pair(source, row, neighbors, radius))
         else:
-            views = isinstance(source, scenes.SceneSource) and source.single
-            drawn = sampling if views else recorded
+            single = isinstance(source, scenes.SceneSource) and source.single
+            drawn = views if single else recorded
             pairs.append(source.draw(row, drawn, np.random.default_rng(index)))
     return {key: np.stack([pair[key] for pair in pairs]) for key in pairs[0]}
 
 
-def _protocol_pair(source: ShapeSource, index: int, sampling: Sampling) -> dict:
+def _protocol_pair(source: ShapeSource, index: int, neighbors: int, radius: float) -> dict:
     pair = protocol.fixed_pair(source.corpus, index, protocol.partial)
     made = {"transform": pair.transform, "estimate_normals": False}
     for side in ("source", "target"):
         cloud = made[side] = getattr(pair, side)
         made[f"{side}_normals"] = getattr(pair, f"{side}_normals")
-        made[f"{side}_neighbors"] = nearest_on_host(
-            cloud, sampling.neighbors, radius=sampling.radius
-        )
+        made[f"{side}_neighbors"] = nearest_on_host(cloud, neighbors, radius=radius)
     return made
 
 

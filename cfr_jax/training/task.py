@@ -13,10 +13,9 @@ from jax.sharding import Mesh
 from cfr_jax import weights
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.batches import Mixture
+from cfr_jax.data.build import ENOUGH
 from cfr_jax.training import devices, optimizers, sources, step
 from cfr_jax.training.learner import Learner, Phase, learner
-
-_FEW = 30  # validation pairs below which the best weights are a matter of chance
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -90,12 +89,13 @@ def prepare(config: Any, workdir: Path) -> Task:
     sources.check_apart(mixture, held_out)
     sources.check_readable(mixture, workdir, "data.train")
     sources.check_readable(held_out, workdir, "data.validation")
-    validated = dataclasses.replace(
+    pairs = sources.fixed_pairs(
+        held_out,
+        config.validation_pairs,
         samplings[-1],
-        neighbors=min(chosen.validated.neighbors, samplings[-1].points - 1),
-        radius=chosen.validated.radius,
+        chosen.validated.neighbors,
+        chosen.validated.radius,
     )
-    pairs = sources.fixed_pairs(held_out, config.validation_pairs, validated)
     return Task(
         learner=chosen,
         mesh=mesh,
@@ -134,9 +134,9 @@ def _told(config, mixture, held_out, count, workdir):
         f"training on {sources.told(mixture)}, from {begun}; "
         f"validated on {count} pairs of {sources.told(held_out)}; all of it goes to {workdir}"
     ]
-    if count < _FEW:
+    if count < ENOUGH:
         told.append(
             f"only {count} validation pairs: which weights are best is a matter of chance with "
-            f"fewer than {_FEW}"
+            f"fewer than {ENOUGH}"
         )
     return tuple(told)
