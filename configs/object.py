@@ -21,7 +21,7 @@ def get_config() -> ConfigDict:
         {"steps": 6000, "points": 256, "neighbors": 24, "batch": 8},
         {"steps": 4750, "points": 358, "neighbors": 32, "batch": 8},
         {"steps": 5250, "points": 358, "neighbors": 32, "batch": 8, "sampling": estimated},
-        {"steps": 2500, "points": 717, "neighbors": 64, "batch": 8, "sampling": estimated},
+        {"steps": 1800, "points": 717, "neighbors": 64, "batch": 8, "sampling": estimated},
     )
     config.train.optimizer = "muon"
     config.train.schedule = "wsd"
