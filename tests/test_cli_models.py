@@ -16,7 +16,7 @@ import pytest
 
 from cfr_jax import cards, reproduction
 from cfr_jax.batch.stream import Outcome
-from cfr_jax.cli import main, make_parser
+from cfr_jax.cli import main, make_parser, models
 from cfr_jax.io import PointCloud
 from cfr_jax.weights import read_weights, shipped
 
@@ -50,6 +50,13 @@ def test_cards_are_listed_for_people_and_for_scripts(capsys):
     document = json.loads(capsys.readouterr().out)
     schema("models").validate(document)
     assert [card["name"] for card in document["models"]] == list(cards.names())
+
+
+def test_scores_are_told_in_the_unit_they_were_measured_in():
+    scores = {"err_r_mean": 1.5, "err_r_median": 0.5, "recall_1deg_0.02": 0.25, "recall_5deg_2m": 1}
+    assert models.scores_in_words(scores) == (
+        "rotation 1.50° mean, 0.50° median; 25% within 1° and 0.02, 100% within 5° and 2m"
+    )
 
 
 def test_models_are_listed_without_jax():

@@ -51,8 +51,10 @@ def run(args: argparse.Namespace) -> int:
 
 def scores_in_words(scores: dict[str, float]) -> str:
     """Mean and median rotation error, and the shares of pairs that were solved."""
-    return (
-        f"rotation {scores['err_r_mean']:.2f}° mean, {scores['err_r_median']:.2f}° median; "
-        f"{scores['recall_1deg_0.02']:.0%} within 1° and 0.02, "
-        f"{scores['recall_5deg_0.1']:.0%} within 5° and 0.1"
-    )
+    recalls = []
+    for name, share in scores.items():
+        if name.startswith("recall_"):
+            angle, distance = name.removeprefix("recall_").split("deg_")
+            recalls.append(f"{share:.0%} within {angle}° and {distance}")
+    errors = f"{scores['err_r_mean']:.2f}° mean, {scores['err_r_median']:.2f}° median"
+    return f"rotation {errors}; {', '.join(recalls)}"
