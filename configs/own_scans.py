@@ -28,6 +28,9 @@ def get_config() -> ConfigDict:
         "scans": {"kind": "scans", "path": "", "repeat": 1},
         "pairs": {"kind": "pairs", "path": "", "repeat": 0},
     }
+    config.phases = ({"steps": 2000, "points": 1024, "neighbors": 32, "batch": 8},)
+    config.validate_every = 250
+
     config.sampling.keep = (0.5, 0.9)
     config.sampling.both_ways = 1.0
     config.sampling.estimated_normals = 0.7  # of those that have normals; the rest always

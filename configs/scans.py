@@ -31,7 +31,7 @@ def get_config() -> ConfigDict:
     }
     config.data.test_frames = {"lidar": (52, 69), "rgbd": (400, 500)}
 
-    config.phases = ({"steps": 1000, "points": 1024, "neighbors": 32, "batch": 8},)
+    config.phases = ({"steps": 500, "points": 1024, "neighbors": 32, "batch": 8},)
 
     config.sampling.keep = (0.7, 1.0)  # scans overlap in part as they are
     config.sampling.translation = 0.15  # each cloud lies about its own centroid
@@ -45,5 +45,5 @@ def get_config() -> ConfigDict:
     config.train.peak_rate = 3e-4
     config.train.start_from = "object"
     config.validation_pairs = 100
-    config.validate_every = 250
+    config.validate_every = 125
     return config
