@@ -59,13 +59,13 @@ def third_party_imports(*, at_the_top: bool) -> set[str]:
     return {INSTALLED_AS.get(name, name) for name in foreign} - {"jaxlib"}
 
 
-def test_the_wheel_holds_every_file_of_the_package_and_no_other(wheel):
+def test_the_wheel_holds_every_file_of_the_package_but_the_baseline_and_no_other(wheel):
     # given
     kept = {
         str(path.relative_to(ROOT))
         for path in PACKAGE.rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
-    }
+        if path.is_file() and "__pycache__" not in path.parts and path.stem != "rpmnet"
+    } | {"cfr_jax/rpmnet.py"}
 
     # when
     packed = {name for name in wheel.namelist() if ".dist-info/" not in name}
@@ -94,10 +94,13 @@ def test_the_wheel_holds_what_is_opened_at_run_time(wheel, name):
     assert wheel.getinfo(f"cfr_jax/{name}").file_size > 0 or name == "py.typed"
 
 
-def test_the_weights_that_are_loaded_by_default_are_in_the_wheel(wheel):
+def test_weights_that_have_a_card_are_in_the_wheel(wheel):
+    from cfr_jax import cards
     from cfr_jax.weights import DEFAULT
 
-    assert f"cfr_jax/models/{DEFAULT}.safetensors" in wheel.namelist()
+    held = {name for name in wheel.namelist() if name.startswith("cfr_jax/models/")}
+    for name in {*cards.names(), DEFAULT}:
+        assert {f"cfr_jax/models/{name}.{end}" for end in ("safetensors", "json", "md")} <= held
 
 
 def test_the_wheel_stays_small_enough_for_an_index(wheel):
