@@ -1,6 +1,7 @@
-"""A long training on the open CAD corpus: as `open_cad.py`, some six hours on two cores.
+"""A long training on the open CAD corpus: the data and augmentation of `open_cad.py`.
 
-A restart costs nothing but the steps since the last checkpoint, so the run may be made in pieces.
+Some five hours on two cores. A restart costs nothing but the steps since the last checkpoint, so
+the run may be made in pieces.
 """
 
 import runpy

@@ -55,7 +55,7 @@ def test_cards_are_listed_for_people_and_for_scripts(capsys):
 def test_scores_are_told_in_the_unit_they_were_measured_in():
     scores = {"err_r_mean": 1.5, "err_r_median": 0.5, "recall_1deg_0.02": 0.25, "recall_5deg_2m": 1}
     assert models.scores_in_words(scores) == (
-        "rotation 1.50° mean, 0.50° median; 25% within 1° and 0.02, 100% within 5° and 2m"
+        "rotation 1.50° mean, 0.50° median; 25% within 1° and 0.02, 100% within 5° and 2 m"
     )
 
 

@@ -55,6 +55,7 @@ def scores_in_words(scores: dict[str, float]) -> str:
     for name, share in scores.items():
         if name.startswith("recall_"):
             angle, distance = name.removeprefix("recall_").split("deg_")
+            distance = distance.replace("m", " m")
             recalls.append(f"{share:.0%} within {angle}° and {distance}")
     errors = f"{scores['err_r_mean']:.2f}° mean, {scores['err_r_median']:.2f}° median"
     return f"rotation {errors}; {', '.join(recalls)}"
