@@ -50,7 +50,9 @@ def main(_) -> None:
     workdir = Path(_WORKDIR.value)
     try:
         if not _COORDINATOR.value:
-            cores = devices.of_cores(*(phase["batch"] for phase in _CONFIG.value.phases))
+            # what a phase lacks is said by `run`
+            batches = (phase.get("batch", 1) for phase in _CONFIG.value.phases)
+            cores = devices.of_cores(*batches)
             if cores is not None:
                 jax.config.update("jax_num_cpu_devices", cores)
         keep_compiled_programs()

@@ -58,7 +58,11 @@ def main() -> None:
         settings=Settings(neighbors=args.neighbors, detach_motion=True),
         optimizer=optimizer,
         mesh=devices.make_mesh(),
+        correspondence_weight=0.05,
+        average_decay=0.999,
         pairs_at_once=1 if cpu else args.batch // len(jax.devices()),
+        precision="float32",
+        max_skipped=20,
     )
 
     def ours(state):

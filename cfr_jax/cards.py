@@ -24,15 +24,21 @@ def names() -> tuple[str, ...]:
 def read_card(name: str) -> dict[str, Any]:
     """The card of shipped weights, with the digest, size and count of numbers of their file.
 
-    Raises ValueError where there are no such weights, and where the card was written for others.
+    Raises ValueError where there are no such weights, where one of the two files is damaged, and
+    where the card was written for others.
     """
     if name not in names():
         raise ValueError(f"no weights called {name!r}; shipped are {', '.join(names())}")
-    card = json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
+    path = FOLDER / f"{name}.json"
+    try:
+        card = json.loads(path.read_text("utf-8"))
+        sha256 = card["sha256"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is damaged: no card of weights ({error!r})") from error
     file = file_facts(FOLDER / f"{name}.safetensors")
-    if card["sha256"] != file["sha256"]:
+    if sha256 != file["sha256"]:
         raise ValueError(
-            f"the card of {name!r} is of other weights ({card['sha256'][:12]}) than those that "
+            f"the card of {name!r} is of other weights ({sha256[:12]}) than those that "
             f"are there ({file['sha256'][:12]})\n"
             f"`python benchmarks/model_card.py {name}` measures and writes it anew"
         )
@@ -40,12 +46,20 @@ def read_card(name: str) -> dict[str, Any]:
 
 
 def file_facts(path: Path) -> dict[str, Any]:
-    """Digest, parameters and bytes of a safetensors file, from its header alone."""
-    with open(path, "rb") as stream:
-        header = json.loads(stream.read(int.from_bytes(stream.read(8), "little")))
-    told = header.pop("__metadata__", {})
-    return {
-        "sha256": told.get("sha256", ""),
-        "parameters": sum(math.prod(tensor["shape"]) for tensor in header.values()),
-        "bytes": path.stat().st_size,
-    }
+    """Digest, parameters and bytes of a safetensors file, from its header alone.
+
+    Raises ValueError, naming the file, where that cannot be read; what it says is not checked.
+    """
+    size = path.stat().st_size
+    try:
+        with open(path, "rb") as stream:
+            length = int.from_bytes(stream.read(8), "little")
+            header = json.loads(stream.read(min(length, size)))
+        told = header.pop("__metadata__", {})
+        return {
+            "sha256": str(told.get("sha256", "")),
+            "parameters": sum(math.prod(tensor["shape"]) for tensor in header.values()),
+            "bytes": size,
+        }
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged: no header of safetensors ({error!r})") from error

@@ -53,7 +53,7 @@ def pair_loss(
     steps = list(steps)
     there = rigid.apply(truth, source.points)
     spread = _squared_distances(there, target.points)
-    pose = correspondence = 0.0
+    pose = correspondence = jnp.zeros((), there.dtype)
     for i, step in enumerate(steps):
         discount = _DISCOUNT ** (len(steps) - 1 - i)
         pose += discount * _pose_term(step, source.points, there)

@@ -39,6 +39,7 @@ def get_config() -> ConfigDict:
     config.sampling.outliers = (0.0, 0.0)  # share of the points
     config.sampling.noise = (0.01, 0.01)  # per axis
     config.sampling.sensor_noise = 0.0  # of the pairs: along the rays of a depth sensor instead
+    config.sampling.sensor_scale = (0.005, 0.02)  # its standard deviation at the middle
     config.sampling.estimated_normals = 0.4
 
     config.train = ConfigDict()

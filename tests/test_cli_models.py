@@ -79,6 +79,30 @@ def test_a_card_of_other_weights_is_refused(tmp_path, monkeypatch):
         cards.read_card("object")
 
 
+def test_damaged_files_are_named_whatever_bit_flipped(tmp_path, monkeypatch):
+    for suffix in (".json", ".safetensors"):
+        shutil.copy(cards.FOLDER / f"object{suffix}", tmp_path)
+    monkeypatch.setattr(cards, "FOLDER", tmp_path)
+    rng = np.random.default_rng(0)
+    for suffix in (".json", ".safetensors"):
+        path = tmp_path / f"object{suffix}"
+        content = path.read_bytes()
+        header = min(len(content), 8 + int.from_bytes(content[:8], "little"))
+        places = [*range(8), *rng.integers(header, size=200).tolist()]
+        for at in places:
+            flipped = bytes([content[at] ^ 1 << int(rng.integers(8))])
+            path.write_bytes(content[:at] + flipped + content[at + 1 :])
+            try:
+                cards.read_card("object")  # a changed word of prose is still a card
+            except ValueError as error:
+                assert "object" in str(error)
+        path.write_bytes(content[: header // 2])
+        with pytest.raises(ValueError, match=f"object{suffix} is damaged"):
+            cards.read_card("object")
+        path.write_bytes(content)
+    cards.read_card("object")
+
+
 def test_the_pairs_are_the_same_every_time_and_all_differ():
     first, again = reproduction.make_pairs(26), reproduction.make_pairs(26)
     for one, other in zip(first, again, strict=True):

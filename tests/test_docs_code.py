@@ -22,6 +22,7 @@ import jax
 import pytest
 
 from cfr_jax import cli, io
+from cfr_jax.data.pairs import open_pairs
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "cfr_jax" / "demo"
@@ -105,6 +106,14 @@ def commands_in_tables(path: Path) -> list[list[str]]:
         if line.startswith("|")
         for command in re.findall(r"\| `(cfr [^`]+)` \|$", line)
     ]
+
+
+def test_the_pairs_that_a_page_lists_are_pairs(tmp_path):
+    page = (ROOT / "docs" / "train-on-your-data.md").read_text("utf-8")
+    (line,) = [line for line in page.splitlines() if line.count(",") == 17]
+    (tmp_path / "listed.csv").write_text(line)
+
+    assert len(open_pairs(tmp_path / "listed.csv")) == 1
 
 
 def with_blocks(select) -> list[str]:

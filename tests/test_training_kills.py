@@ -43,36 +43,41 @@ def test_a_run_killed_at_random_moments_ends_bit_equal(tmp_path):
     given.phases = ({"steps": 60, "points": 24, "neighbors": 6, "batch": 2},)
     given.checkpoint_every, given.validate_every = 3, 9
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    began = time.monotonic()
     process = start(given, whole)
+    wait_for_checkpoint(process, whole, after=0)
+    began = time.monotonic()
     output, _ = process.communicate(timeout=1800)
     assert process.returncode == 0, output
-    took = time.monotonic() - began
+    stepping = time.monotonic() - began
 
     chance = random.Random(0)
-    reached = []
+    reached = [0]
     for _ in range(KILLS):
         process = start(given, killed)
-        # a moment from the first sign of life to the end of all steps
-        deadline = time.monotonic() + 10 * took + 60
-        while not list(killed.glob("checkpoints/*/manifest.json")):
-            assert process.poll() is None and time.monotonic() < deadline
-            time.sleep(0.02)
-        time.sleep(chance.uniform(0, took / KILLS))
+        # a moment among the steps, not while it still starts and compiles
+        wait_for_checkpoint(process, killed, after=reached[-1])
+        time.sleep(chance.uniform(0, stepping / KILLS))
         process.send_signal(signal.SIGKILL)
         process.communicate()
         reached.append(newest(killed))
+    assert reached[-1] < 60, "killed too late to tell"
     process = start(given, killed)
     output, _ = process.communicate(timeout=1800)
     assert process.returncode == 0, output
 
-    assert reached[0] < 60, "killed too late to tell"
     (first, about), (second, told) = (state_of(folder) for folder in (whole, killed))
     assert int(first.step) == 60
     assert_same(first, second)
     assert about["best"] == told["best"] and about["position"] == told["position"]
     assert_same(*(weights.load_params(f / "weights.safetensors") for f in (whole, killed)))
     assert steps_told(killed) == steps_told(whole)
+
+
+def wait_for_checkpoint(process, workdir, after):
+    deadline = time.monotonic() + 600
+    while newest(workdir) <= after:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def steps_told(workdir):
@@ -82,8 +87,8 @@ def steps_told(workdir):
 
 
 def newest(workdir):
-    return max(int(path.parent.name) for path in workdir.glob("checkpoints/*/manifest.json")
-               if path.parent.name.isdigit())  # fmt: skip
+    made = (path.name for path in workdir.glob("checkpoints/*"))
+    return max((int(name) for name in made if name.isdigit()), default=0)
 
 
 def state_of(workdir):

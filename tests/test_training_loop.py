@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 
 import jax
@@ -12,10 +13,11 @@ from training_samples import assert_same, config
 
 from cfr_jax import weights
 from cfr_jax.data.augment import Sampling
-from cfr_jax.training import devices, learner, loop, optimizers, step, validation
+from cfr_jax.training import devices, learner, loop, optimizers, step, stopping, validation
+from cfr_jax.training.board import Board
 from cfr_jax.training.checkpoints import Checkpoints, SaveError
 from cfr_jax.training.stopping import Stopped
-from cfr_jax.training.task import prepare
+from cfr_jax.training.task import fresh_params, prepare
 
 
 @pytest.fixture(scope="module")
@@ -235,10 +237,73 @@ def test_gradients_that_stay_infinite_stop_the_run(corpus_file, tmp_path, monkey
         return train_step(state, batch, **named)
 
     monkeypatch.setattr(step, "train_step", broken_after_four)
-    with pytest.raises(loop.Diverged, match="last 4 of 8 steps had gradients that are not finite"):
+    with pytest.raises(
+        stopping.Diverged, match="by step 8, more than .*max_skipped = 3 steps in a row.*not finite"
+    ):
         run(config(corpus_file), tmp_path)
 
     assert int(state_of(tmp_path).step) == 4
+    text = (tmp_path / "metrics.jsonl").read_text()
+    last = [json.loads(line, parse_constant=pytest.fail) for line in text.splitlines()][-1]
+    assert last["step"] == 8 and last["skipped"] == 4 and "loss" not in last
+
+
+def test_too_many_infinite_gradients_between_two_looks_stop_it_as_well(
+    corpus_file, tmp_path, monkeypatch
+):
+    train_step = step.train_step
+
+    def broken_for_four(state, batch, **named):
+        if 4 <= int(state.step) < 8:
+            batch = batch | {"source": batch["source"] * np.float32("nan")}
+        return train_step(state, batch, **named)
+
+    monkeypatch.setattr(step, "train_step", broken_for_four)
+    given = config(corpus_file)
+    given.log_every = given.checkpoint_every = given.validate_every = 100
+    with pytest.raises(stopping.Diverged, match="by step 16, more than train.max_skipped = 3"):
+        run(given, tmp_path)
+
+    assert not list((tmp_path / "checkpoints").glob("[0-9]*"))
+
+
+def test_answers_that_are_no_numbers_are_no_validation(monkeypatch):
+    found = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1, 1))
+    found[1, 0, 0, 3] = np.nan
+    monkeypatch.setattr(step, "predict", lambda *_, **__: jax.numpy.asarray(found))
+    chosen = learner.learner(config("nowhere.h5"))
+
+    with pytest.raises(stopping.Diverged, match="answers to 1 of 3 validation pairs"):
+        validation.validate(chosen, {}, {}, found[:, 0], devices.make_mesh())
+
+
+def test_the_last_steps_are_told_though_they_are_fewer(corpus_file, tmp_path):
+    given = config(corpus_file)
+    given.log_every = 5
+
+    run(given, tmp_path)
+
+    assert [line["step"] for line in lines_of(tmp_path) if "loss" in line] == [5, 10, 15, 16]
+
+
+def test_a_finished_run_is_validated_anew_on_other_pairs(corpus_file, whole, tmp_path, capsys):
+    folder = shutil.copytree(whole[0], tmp_path / "finished")
+    changed = config(corpus_file)
+    changed.validation_pairs = 3
+
+    best = run(changed, folder)
+
+    assert best["step"] == 16 and "best so far is forgotten" in capsys.readouterr().out
+    made = weights.read_weights(folder / "weights.safetensors")
+    assert json.loads(made.notes["validation"]) == best
+
+
+def test_weights_to_start_from_have_the_iterations_that_are_asked_for(corpus_file, whole):
+    given = config(corpus_file)
+    given.train.start_from, given.iterations = str(whole[0] / "weights.safetensors"), 2
+
+    with pytest.raises(ValueError, match="start_from: .*other iterations than .*iterations = 2"):
+        fresh_params(given, learner.learner(given))
 
 
 def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monkeypatch, whole):
@@ -252,6 +317,12 @@ def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monk
     def no_space(folder):
         raise OSError(28, "No space left on device", str(folder))
 
+    def closed_in_vain(self):
+        close(self)
+        raise OSError("an error that comes later and must not hide the first")
+
+    close = Board.close
+    monkeypatch.setattr(Board, "close", closed_in_vain)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Checkpoints, "_finish", full_after_step_8)
         with pytest.raises(SaveError, match="step 12 .*\n?.*last good one is of step 8") as stopped:
@@ -272,6 +343,11 @@ def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monk
         ({"train.precision": "float16"}, "precision: got 'float16'"),
         ({"train.pairs_at_once": 0}, "pairs_at_once: got 0"),
         ({"train.workers": 0}, "workers: got 0"),
+        ({"train.max_skipped": -1}, "max_skipped: got -1"),
+        ({"log_every": 0}, "log_every: got 0"),
+        ({"validation_pairs": 0}, "validation_pairs: got 0"),
+        ({"settings": {"neighbors": 5}}, "settings: got neighbors, wanted some of .*radius"),
+        ({"sampling.radius": 0.2}, "sampling: .*radius"),
         ({"data.train": "nowhere.h5"}, "nowhere.h5"),
         ({"sampling.keep": (0.0, 2.0)}, "keep"),
         ({"sampling.keep": (0.5, 0.3)}, "keep: got .*the lower one first"),
@@ -296,12 +372,27 @@ def test_a_phase_may_be_sampled_in_its_own_way(corpus_file, tmp_path):
 
     assert (first.estimated_normals, second.estimated_normals) == (0.5, 1.0)
     assert first.keep == second.keep == (0.7, 0.7)
+    assert first.radius == 0.3
     given.phases[1]["sampling"] = {"estimated": 1.0}
     with pytest.raises(ValueError, match="sampling: .*'estimated'"):
         prepare(given, tmp_path)
     given.phases[0]["step"] = 3
     with pytest.raises(ValueError, match="phases: .*'step'"):
         prepare(given, tmp_path)
+    given = config(corpus_file)
+    given.phases[1]["steps"] = -1
+    with pytest.raises(ValueError, match="phases: got -1 steps"):
+        prepare(given, tmp_path)
+
+
+def test_neighbors_are_trained_on_within_the_radius_that_is_validated(corpus_file, tmp_path):
+    given = config(corpus_file)
+    given.settings = {"radius": 0.2}
+
+    task = prepare(given, tmp_path)
+
+    assert [sampling.radius for sampling in task.samplings] == [0.2, 0.2]
+    assert task.learner.validated.radius == 0.2
 
 
 def test_validation_measures_the_last_transform(corpus_file, monkeypatch):

@@ -1,6 +1,7 @@
 """What a training says: clock, journal, TensorBoard, and the page at the end."""
 
 import json
+import resource
 import subprocess
 import sys
 import time
@@ -37,6 +38,16 @@ def test_means_are_over_pairs_and_steps():
     assert found["beta"] == [3.0] * L and found["alpha"] == [4.5] * L
 
 
+def test_a_pair_that_is_not_finite_is_left_out_of_the_means():
+    spoiled = measured(2.0)
+    spoiled.total[1] = np.nan
+
+    found = log.summarize([measured(1.0), spoiled])
+
+    assert found["loss"] == found["rotation_error"][0] == pytest.approx((3 * 1.0 + 2 * 2.0) / 5)
+    assert log.summarize([measured(np.inf)]) == {}
+
+
 def test_the_clock_stands_still_between_stop_and_start_and_goes_on_from_before():
     clock = log.Clock(100.0, 200.0)
     clock.start()
@@ -61,6 +72,15 @@ def test_a_journal_forgets_what_comes_after_the_step_it_goes_on_from(tmp_path):
     journal.write({"step": 3, "again": True})
 
     assert log.read_journal(path) == [{"step": 1}, {"step": 2}, {"step": 3, "again": True}]
+
+
+def test_a_journal_that_begins_anew_forgets_all(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"step": 0}\n{"step": 50}\n')  # killed before the first checkpoint
+
+    log.Journal(path, 0)
+
+    assert log.read_journal(path) == []
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +110,46 @@ def test_the_page_of_a_run_without_any_measurement_is_a_page(tmp_path, about):
     write_summary(tmp_path / "summary.html", [], about | {"best": {}})
 
     assert "none" in (tmp_path / "summary.html").read_text()
+
+
+def test_the_page_draws_as_many_iterations_as_there_are(tmp_path, about):
+    lines = [line(2) | {"alpha": [1.0] * 7, "beta": [1.0] * 7}]
+
+    write_summary(tmp_path / "summary.html", lines, about)
+
+    page = (tmp_path / "summary.html").read_text()
+    assert page.count("iteration 7") == 2
+
+
+def test_a_full_disk_is_told_by_the_board_and_nothing_waits_for_it(tmp_path):
+    pytest.importorskip("tensorboardX")
+    written = board.Board(tmp_path / "tensorboard", 0)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200, before[1]))
+    try:
+        for _ in range(20):  # more than a queue would hold
+            with pytest.raises(OSError, match="tensorboard could not be written .*make room"):
+                written.training(line(2), [measured(1.0)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    written.close()
+
+
+def test_without_matplotlib_there_are_no_pictures_and_it_is_told(tmp_path, monkeypatch):
+    pytest.importorskip("tensorboardX")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    found = {name: 1.0 for name in board._VALIDATIONS} | {"rotation_by_iteration": [2.0, 1.0]}
+
+    written = board.Board(tmp_path, 0)
+    cloud = np.zeros((3, 3))
+    written.validation(
+        2, found, [("pair_0", Scene(cloud, cloud, np.stack([np.eye(4)] * 2), ["start", "1"]))]
+    )
+    written.close()
+
+    assert "cfr_jax[viz]" in written.missing
+    (path,) = tmp_path.glob("events*")
+    assert b"rotation_mean" in path.read_bytes() and b"pair_0" not in path.read_bytes()
 
 
 def test_tensorboard_gets_scalars_histograms_and_pictures(tmp_path):

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from cfr_jax import io
 from cfr_jax.data.augment import Sampling
+from cfr_jax.data.pairs import Pair
 from cfr_jax.training import scenes, sources
 
 FAR = np.array([5e6, -2e6, 100.0])  # map coordinates, meters
@@ -215,6 +216,43 @@ def test_scans_that_cannot_be_read_are_all_named_before_any_training(tmp_path, s
     again = opened()
     sources.check_readable(again, cache, "data.train")
     assert reads == 1 and again.sources[0].read.cache_info().misses == 0  # remembered
+
+
+def test_scans_of_too_few_points_are_named_before_any_training(tmp_path, surface):
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    io.write(scans / "good.ply", io.PointCloud(surface))
+    io.write(scans / "few.ply", io.PointCloud(surface[:3]))
+    io.write(scans / "same.ply", io.PointCloud(np.ones((500, 3))))
+    about = {"kind": "scans", "path": str(scans)}
+    mixture = sources.open_mixture(given(mine=about), tmp_path, "data.train")
+
+    with pytest.raises(
+        ValueError, match=r"2 scans cannot be used.*\n.*few\.ply.* 3 points.*\n.*same\.ply.* 500"
+    ):
+        sources.check_readable(mixture, tmp_path, "data.train")
+
+
+def test_a_pair_that_cannot_be_drawn_is_named():
+    heap = np.zeros((500, 3))
+    pair = Pair("heap.ply", heap, heap, transform=np.eye(4))
+    source = scenes.SceneSource(("a/heap.ply",), (("a", "a"),), lambda _: pair, "stamp")
+
+    with pytest.raises(ValueError, match="^a/heap.ply: .*all are alike"):
+        source.draw(0, WHOLE, np.random.default_rng(0))
+
+
+def test_of_a_scan_of_many_points_no_more_are_held_than_thinning_looks_at(tmp_path):
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(3 * scenes._MOST, 3))
+    io.write(tmp_path / "big.ply", io.PointCloud(points, normals=points))
+
+    pair = scenes.scans_source(tmp_path).read(0)
+
+    assert pair.source.shape == pair.source_normals.shape == (scenes._MOST, 3)
+    directions = pair.source / np.linalg.norm(pair.source, axis=1, keepdims=True)
+    alike = np.einsum("ni,ni->n", directions, pair.source_normals)
+    assert (alike > 0.99).all()  # each point keeps its own
 
 
 def test_the_stamp_of_data_goes_by_what_they_are_and_not_by_where_they_lie(tmp_path, surface):

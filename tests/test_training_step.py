@@ -67,6 +67,31 @@ def test_a_batch_that_is_not_finite_changes_nothing_but_the_counts(batch):
     assert int(after.skipped) == 2 and int(after.skipped_in_row) == 0
 
 
+def test_after_too_many_of_them_in_a_row_nothing_changes_until_somebody_looks(batch):
+    broken = batch | {"source": np.full_like(batch["source"], np.nan)}
+    state = fresh()
+    for _ in range(samples.MAX_SKIPPED):
+        state, _ = step(state, broken)
+    state, _ = step(state, batch)
+    assert int(state.skipped_in_row) == 0  # as many as allowed
+    kept = jax.tree.map(np.array, state.params)
+
+    for _ in range(samples.MAX_SKIPPED + 1):
+        state, _ = step(state, broken)
+    state, _ = step(state, batch)
+
+    assert_same(state.params, kept)
+    assert int(state.skipped_in_row) == samples.MAX_SKIPPED + 2
+
+
+def test_the_pose_alone_can_be_trained_on(batch):
+    advance = functools.partial(train_step.__wrapped__, recipe=recipe(correspondence_weight=0.0))
+
+    _, measured = jax.eval_shape(advance, fresh(), batch)
+
+    assert measured.correspondence.shape == measured.total.shape == (BATCH,)
+
+
 def test_pairs_one_by_one_or_together_make_the_same_step(batch):
     alone, first_losses = step(fresh(), batch)
     together, losses = step(fresh(), batch, pairs_at_once=BATCH)

@@ -11,7 +11,7 @@ from cfr_jax import iterations, network, prepared
 from cfr_jax.training import devices, step
 from cfr_jax.training.optimizers import make_optimizer, make_schedule
 
-POINTS, NEIGHBORS, BATCH, STEPS = 24, 6, 2, 16
+POINTS, NEIGHBORS, BATCH, STEPS, MAX_SKIPPED = 24, 6, 2, 16, 3
 SETTINGS = prepared.Settings(neighbors=NEIGHBORS, detach_motion=True)
 
 
@@ -30,6 +30,9 @@ def recipe(**changes):
         "mesh": devices.make_mesh(),
         "correspondence_weight": 0.05,
         "average_decay": 0.9,
+        "pairs_at_once": 1,
+        "precision": "float32",
+        "max_skipped": MAX_SKIPPED,
     }
     return step.Recipe(**given | changes)
 
@@ -66,7 +69,7 @@ def config(corpus_file):
         "optimizer": "adamw", "schedule": "cosine", "peak_rate": 5e-3, "warmup": 0.1,
         "cooldown": 0.2, "clip": 1.0, "weight_decay": 1e-5, "start_from": "",
         "correspondence_weight": 0.05, "average_decay": 0.9, "pairs_at_once": 1, "workers": 2,
-        "precision": "float32", "max_skipped": 3,
+        "precision": "float32", "max_skipped": MAX_SKIPPED,
     }  # fmt: skip
     given.log_every, given.checkpoint_every, given.validate_every = 4, 4, 4
     given.validation_pairs, given.keep_checkpoints = 2, 2

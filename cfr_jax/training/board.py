@@ -1,8 +1,16 @@
-"""The same measurements for TensorBoard, with histograms and pictures, where it is installed."""
+"""The same measurements for TensorBoard, with histograms and pictures, where it is installed.
+
+The records are tensorboardX's, but not its usual writer, which works in a thread: where a disk is
+full, that dies unheard, and the training waits for it for ever.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,65 +22,105 @@ from cfr_jax.viewer.scene import Scene
 
 _SCALARS = ("loss", "pose", "correspondence", "learning_rate", "steps_per_second", "skipped")
 _VALIDATIONS = ("rotation_mean", "rotation_median", "translation_mean", "recall_5deg_0.1")
+_BINS = 30  # of a histogram
 MISSING = 'no TensorBoard files: pip install "cfr_jax[train]" to have them'
+NO_PICTURES = 'no pictures among the TensorBoard files: pip install "cfr_jax[viz]" to have them'
 
 
 class Board:
-    """Event files in `folder`; does nothing, and says so in `missing`, without tensorboardX."""
+    """Event files in `folder`. Without tensorboardX there are none, without matplotlib no pictures
+    in them; `missing` says so.
+
+    Every method raises OSError, naming the folder, where it cannot be written.
+    """
 
     def __init__(self, folder: Path, step: int):
         self.missing: str | None = None
-        self._writer: Any = None
-        try:
-            from tensorboardX import SummaryWriter
-        except ModuleNotFoundError:
+        self._folder = folder
+        self._events: Any = None
+        if importlib.util.find_spec("tensorboardX") is None:
             self.missing = MISSING
             return
-        # what an interrupted run wrote after its last checkpoint is hidden
-        self._writer = SummaryWriter(str(folder), purge_step=step + 1)
+        if importlib.util.find_spec("matplotlib") is None:
+            self.missing = NO_PICTURES
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import SessionLog
+
+        with self._writing():
+            folder.mkdir(parents=True, exist_ok=True)
+            self._events = EventsWriter(str(folder / "events"))
+            # what an interrupted run wrote after its last checkpoint is hidden
+            self._add(step + 1, session_log=SessionLog(status=SessionLog.START))
 
     def training(self, line: dict, measured: list[PairLoss]) -> None:
         """The line of the journal, and how alpha and beta are spread over the pairs."""
-        if self._writer is None:
+        if self._events is None:
             return
-        for name in _SCALARS:
-            self._writer.add_scalar(f"training/{name}", line[name], line["step"])
-        for name in ("rotation_error", "translation_error"):
-            for i, value in enumerate(line[name], start=1):
-                self._writer.add_scalar(f"training/{name}/{i}", value, line["step"])
-        for name in ("alpha", "beta"):
-            spread = np.concatenate([np.asarray(getattr(step, name)) for step in measured])
-            for i, values in enumerate(spread.T, start=1):
-                if np.isfinite(values).all():
-                    self._writer.add_histogram(f"{name}/{i}", values, line["step"])
+        from tensorboardX import summary
+
+        with self._writing():
+            for name in _SCALARS:
+                if name in line:  # there are no means where no pair was sound
+                    self._scalar(f"training/{name}", line[name], line["step"])
+            for name in ("rotation_error", "translation_error"):
+                for i, value in enumerate(line.get(name, ()), start=1):
+                    self._scalar(f"training/{name}/{i}", value, line["step"])
+            for name in ("alpha", "beta"):
+                spread = np.concatenate([np.asarray(getattr(step, name)) for step in measured])
+                for i, values in enumerate(spread.T, start=1):
+                    if np.isfinite(values).all():
+                        drawn = summary.histogram(f"{name}/{i}", values, _BINS)
+                        self._add(line["step"], summary=drawn)
+            self._events.flush()
 
     def validation(self, step: int, found: dict, pictures: list[tuple[str, Scene]]) -> None:
-        """Errors, and pairs as the network laid them; pictures need matplotlib, too."""
-        if self._writer is None:
+        """Errors, and pairs as the network laid them."""
+        if self._events is None:
             return
-        for name in _VALIDATIONS:
-            self._writer.add_scalar(f"validation/{name}", found[name], step)
-        for i, value in enumerate(found["rotation_by_iteration"], start=1):
-            self._writer.add_scalar(f"validation/rotation/{i}", value, step)
-        for name, scene in pictures:
-            pixels = _pixels(scene)
-            if pixels is not None:
-                self._writer.add_image(f"validation/{name}", pixels, step, dataformats="HWC")
+        from tensorboardX import summary
+
+        with self._writing():
+            for name in _VALIDATIONS:
+                self._scalar(f"validation/{name}", found[name], step)
+            for i, value in enumerate(found["rotation_by_iteration"], start=1):
+                self._scalar(f"validation/rotation/{i}", value, step)
+            for name, scene in pictures if self.missing is None else ():
+                drawn = summary.image(f"validation/{name}", _pixels(scene), dataformats="HWC")
+                self._add(step, summary=drawn)
+            self._events.flush()
 
     def close(self) -> None:
-        """Writes what is left."""
-        if self._writer is not None:
-            self._writer.close()
+        """Ends the file."""
+        if self._events is not None:
+            with self._writing():
+                self._events.close()
+
+    def _scalar(self, name, value, step):
+        from tensorboardX import summary
+
+        self._add(step, summary=summary.scalar(name, value))
+
+    def _add(self, step, **content):
+        from tensorboardX.proto.event_pb2 import Event
+
+        self._events.write_event(Event(step=step, wall_time=time.time(), **content))
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OSError(
+                f"{self._folder} could not be written ({error.strerror}); make room, then run the "
+                "same command again"
+            ) from error
 
 
-def _pixels(scene: Scene) -> np.ndarray | None:
-    try:
-        from matplotlib.image import imread
+def _pixels(scene: Scene) -> np.ndarray:
+    from matplotlib.image import imread
 
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "pair.png"
-            write_picture(path, scene)
-            image = imread(path)
-    except ModuleNotFoundError:
-        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "pair.png"
+        write_picture(path, scene)
+        image = imread(path)
     return (image[..., :3] * 255).astype(np.uint8)

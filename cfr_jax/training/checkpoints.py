@@ -95,8 +95,8 @@ class Checkpoints:
     def restore(self, like: TrainState) -> tuple[TrainState, dict] | None:
         """The newest sound state and what was said about it; None if nothing was ever saved.
 
-        Warns of each damaged one. Raises ValueError where all are damaged, and where the newest
-        does not fit `like`.
+        Warns of each damaged one. Raises ValueError where all are damaged, each time anew, and
+        where the newest does not fit `like`.
         """
         step = agree(self._newest_sound() if is_first() else 0)
         if step < 0:
@@ -116,8 +116,7 @@ class Checkpoints:
         return state, json.loads((folder / "about.json").read_text("utf-8"))
 
     def _newest_sound(self):
-        steps = self.steps()
-        for step in reversed(steps):
+        for step in reversed(self.steps()):
             folder = self.folder / str(step)
             try:
                 manifest.verify(folder)
@@ -127,9 +126,10 @@ class Checkpoints:
                 aside = folder.with_name(f"{step}.damaged")
                 shutil.rmtree(aside, ignore_errors=True)
                 folder.rename(aside)
-        if steps:
+        damaged = list(self.folder.glob("*.damaged"))
+        if damaged:
             raise ValueError(
-                f"no sound checkpoint in {self.folder}: {len(steps)} are damaged; "
+                f"no sound checkpoint in {self.folder}: {len(damaged)} are damaged; "
                 "remove the folder to start anew"
             )
         return -1

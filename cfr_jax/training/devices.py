@@ -23,7 +23,7 @@ def join(coordinator: str, processes: int, process: int) -> None:
     """Makes this process number `process` of `processes`, which find each other at `coordinator`.
 
     Call it before anything else of JAX. Without a `coordinator` a single process stays alone.
-    Raises ValueError for numbers that do not fit, RuntimeError where the others are not found.
+    Raises ValueError for numbers that do not fit, ConnectionError where the others are not found.
     """
     if not coordinator:
         if processes != 1 or process != 0:
@@ -34,7 +34,12 @@ def join(coordinator: str, processes: int, process: int) -> None:
         return
     if not 0 <= process < processes:
         raise ValueError(f"process: got {process}, wanted 0 to {processes - 1}")
-    jax.distributed.initialize(coordinator, num_processes=processes, process_id=process)
+    try:
+        jax.distributed.initialize(coordinator, num_processes=processes, process_id=process)
+    except RuntimeError as error:
+        raise ConnectionError(
+            f"coordinator: not all of the {processes} processes met at {coordinator} ({error})"
+        ) from error
 
 
 def of_cores(*batches: int) -> int | None:
@@ -99,6 +104,11 @@ def agree(number: int) -> int:
 
 def check_batch(size: int, pairs_at_once: int, mesh: Mesh) -> None:
     """Raises ValueError for a batch that cannot be spread evenly."""
+    if mesh.size != jax.local_device_count() * jax.process_count():
+        raise ValueError(
+            f"processes: this one has {jax.local_device_count()} of {mesh.size} devices, wanted as "
+            "many in each"
+        )
     share, rest = divmod(size, mesh.size)
     if rest or not share:
         raise ValueError(f"batch: got {size} pairs, wanted a multiple of the {mesh.size} devices")

@@ -36,11 +36,22 @@ class Phase:
     sampling: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Fields of `data.augment.Sampling` that differ from the config's in this phase."""
 
+    def __post_init__(self):
+        if self.steps < 0 or self.batch < 1:
+            raise ValueError(
+                f"phases: got {self.steps} steps of {self.batch} pairs, wanted 0 or more steps of "
+                "at least 1 pair"
+            )
+
 
 def learner(config: Any) -> Learner:
-    """The network that `config.network` names: "cfr", or "rpmnet" to compare with."""
+    """The network that `config.network` names: "cfr", or "rpmnet" to compare with.
+
+    Raises ValueError for another, and for `config.settings` that it does not have.
+    """
     if config.network == "cfr":
         changed = dict(config.get("settings", {}))
+        _check_settings(changed)
         return Learner(
             fresh=lambda key: network.init_params(
                 key, config.iterations, config.get("shared", False)
@@ -57,6 +68,16 @@ def learner(config: Any) -> Learner:
             validated=rpmnet.Settings(),
         )
     raise ValueError(f"network: got {config.network!r}, wanted 'cfr' or 'rpmnet'")
+
+
+def _check_settings(changed: dict[str, Any]) -> None:
+    allowed = {field.name for field in dataclasses.fields(prepared.Settings)}
+    allowed -= {"neighbors", "detach_motion"}  # those of the phases, and of all training
+    if unknown := changed.keys() - allowed:
+        raise ValueError(
+            f"settings: got {', '.join(sorted(unknown))}, wanted some of "
+            f"{', '.join(sorted(allowed))}"
+        )
 
 
 def remaining(phases: Sequence[Phase], step: int) -> Iterator[tuple[Phase, int]]:

@@ -53,15 +53,16 @@ class Journal:
 
     def __init__(self, path: Path, step: int):
         self.path = path
-        # what an interrupted run measured after its last checkpoint will be measured again
-        lines = [line for line in read_journal(path) if line["step"] <= step]
+        # what an interrupted run measured after its last checkpoint will be measured again, and
+        # all of it where there is none
+        lines = [line for line in read_journal(path) if step and line["step"] <= step]
         write_atomically(path, "".join(json.dumps(line) + "\n" for line in lines).encode())
 
     def write(self, line: dict) -> None:
         """Appends one line. Raises OSError, naming the file, where that cannot be written."""
         try:
             with self.path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(line) + "\n")
+                file.write(json.dumps(line, allow_nan=False) + "\n")
         except OSError as error:
             raise OSError(
                 f"{self.path} could not be written ({error.strerror}); make room, then run the "
@@ -81,8 +82,16 @@ def read_journal(path: Path) -> list[dict]:
 
 
 def summarize(measured: list[PairLoss]) -> dict[str, Any]:
-    """Means over the pairs of several steps; alpha and beta per iteration."""
-    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves).mean(axis=0), *measured)
+    """Means over the pairs of several steps; alpha and beta per iteration.
+
+    A pair of which anything is not finite is left out; where that leaves none, nothing is said.
+    """
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *measured)
+    rows = [leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(joined)]
+    sound = np.isfinite(np.concatenate(rows, axis=1)).all(axis=1)
+    if not sound.any():
+        return {}
+    joined = jax.tree.map(lambda leaf: leaf[sound].mean(axis=0), joined)
     return {
         "loss": float(joined.total),
         "pose": float(joined.pose),
@@ -110,7 +119,9 @@ class Bar:
         self._bar.unpause()
 
     def measured(self, line: dict) -> None:
-        """Shows the newest means: rotation error in degrees, translation error in radii."""
+        """Shows the newest means, if any: rotation error in degrees, translation error in radii."""
+        if "loss" not in line:
+            return
         self._bar.set_postfix(
             loss=f"{line['loss']:.3f}",
             RE=f"{line['rotation_error'][-1]:.1f}",

@@ -18,10 +18,6 @@ from cfr_jax.training.step import TrainState
 from cfr_jax.training.task import Task, fresh_params, prepare
 
 
-class Diverged(ValueError):
-    """Too many steps in a row had a gradient that is not finite."""
-
-
 def run(config: Any, workdir: Path) -> dict:
     """Trains by `config` in `workdir`, going on where a checkpoint there left off.
 
@@ -31,8 +27,8 @@ def run(config: Any, workdir: Path) -> dict:
     best validation.
 
     Raises ValueError where config, data or checkpoints cannot be used, `Diverged` where gradients
-    stay infinite, OSError where nothing can be written, and `Stopped` after SIGINT or SIGTERM, once
-    all is saved.
+    or answers stay infinite, OSError where nothing can be written, and `Stopped` after SIGINT or
+    SIGTERM, once all is saved.
     """
     if workdir.exists() and not workdir.is_dir():
         raise ValueError(f"workdir: {workdir} is a file, wanted a folder")
@@ -75,6 +71,8 @@ class _Training:
         with stopping.stop_requests() as requests:
             for phase, ran in remaining(self.task.phases, self.about["step"]):
                 self._go_through(phase, ran, requests)
+        if not self.about["best"]:  # all steps were done, and the validation pairs are others now
+            self._validate()
         self._take_note()
 
     def _go_through(self, phase: Phase, ran: int, requests: stopping.Requests) -> None:
@@ -88,6 +86,7 @@ class _Training:
             average_decay=config.train.average_decay,
             pairs_at_once=config.train.pairs_at_once,
             precision=config.train.precision,
+            max_skipped=config.train.max_skipped,
         )
         stream = batches(
             task.mixture,
@@ -107,13 +106,16 @@ class _Training:
             done = about["step"] = about["step"] + 1
             about["position"] += phase.batch
             self.reports.step(done, measured)
-            if done % config.log_every == 0:
-                self.reports.measured(done, int(self.state.skipped))
-                _stop_if_diverged(int(self.state.skipped_in_row), done, config.train.max_skipped)
+            logging = done % config.log_every == 0 or done == task.steps
             validating = done % config.validate_every == 0 or done == task.steps
+            saving = validating or done % config.checkpoint_every == 0 or requests.received
+            if logging:
+                self.reports.measured(done, int(self.state.skipped))
+            if logging or saving:
+                _stop_if_diverged(int(self.state.skipped_in_row), done, config.train.max_skipped)
             if validating:
                 self._validate()
-            if validating or done % config.checkpoint_every == 0 or requests.received:
+            if saving:
                 self._take_note()
                 self.checkpoints.save(self.state, about.copy(), best=about["best"].get("step"))
             if requests.received:
@@ -146,8 +148,8 @@ class _Training:
 
 def _stop_if_diverged(in_row: int, done: int, most: int) -> None:
     if in_row > most:
-        raise Diverged(
-            f"the last {in_row} of {done} steps had gradients that are not finite, more than "
-            f"train.max_skipped = {most}; the last checkpoint holds the last sound weights.\n"
+        raise stopping.Diverged(
+            f"by step {done}, more than train.max_skipped = {most} steps in a row had gradients "
+            "that are not finite; the last checkpoint holds sound weights.\n"
             "Try a lower train.peak_rate or train.clip, and look for broken shapes in the data"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from pathlib import Path
 
@@ -50,7 +51,9 @@ class Reports:
         """Ends the bar, and writes the page unless something is wrong."""
         self._bar.close()
         if self._journal is not None and self._board is not None:
-            self._board.close()
+            # on a full disk, of two errors the first says what to do
+            with contextlib.nullcontext() if kind is None else contextlib.suppress(OSError):
+                self._board.close()
             if kind is None or issubclass(kind, Stopped):
                 lines = read_journal(self._journal.path)
                 write_summary(self._workdir / "summary.html", lines, self._about)
@@ -96,7 +99,8 @@ class Reports:
         line = {
             "step": done,
             **summarize(self._waiting),
-            "learning_rate": float(self._task.schedule(np.int32(done - 1))),
+            # the optimizer has not seen the steps that were left out
+            "learning_rate": float(self._task.schedule(np.int32(max(0, done - 1 - skipped)))),
             "steps_per_second": steps / max(used["seconds"] - self._written, 1e-9),
             # all of a training, over its restarts, without validations
             "training_seconds": used["seconds"],
@@ -122,8 +126,7 @@ class Reports:
         scenes = []
         for row in np.linspace(0, len(transforms) - 1, _PICTURES).astype(int).tolist():
             stations = np.concatenate([np.eye(4)[None], transforms[row]])
-            if np.isfinite(stations).all():
-                labels = ["start", *(str(i) for i in range(1, len(stations)))]
-                clouds = self._task.pairs["source"][row], self._task.pairs["target"][row]
-                scenes.append((f"pair_{row}", Scene(*clouds, stations, labels)))
+            labels = ["start", *(str(i) for i in range(1, len(stations)))]
+            clouds = self._task.pairs["source"][row], self._task.pairs["target"][row]
+            scenes.append((f"pair_{row}", Scene(*clouds, stations, labels)))
         return scenes

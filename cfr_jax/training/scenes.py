@@ -22,7 +22,9 @@ from cfr_jax.data.layout import CLOUD_SUFFIXES, loose_files, scans_of
 from cfr_jax.data.pairs import CsvPairs, Hdf5Pairs, Pair, among, open_pairs
 from cfr_jax.data.protocol import crop
 
-_HELD = 256  # pairs in memory: reading one takes longer than drawing from it
+_HELD = 128  # pairs in memory: reading one takes longer than drawing from it
+_MOST = 1 << 16  # points of a cloud in memory, at random: thinning looks at no more
+_FEWEST = 16  # points that differ: of fewer, crops and neighborhoods are no surfaces
 Frames = tuple[int, int] | None
 """Only pairs whose frames both are at least the first and below the second; None: all."""
 
@@ -46,7 +48,12 @@ class SceneSource:
 
     def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
         """A crop and a draw of points of each cloud, in the unit sphere."""
-        pair = self.read(index)
+        try:
+            return self._draw(self.read(index), sampling, rng)
+        except ValueError as error:
+            raise ValueError(f"{self.names[index]}: {error}") from error
+
+    def _draw(self, pair: Pair, sampling: Sampling, rng: np.random.Generator) -> dict:
         uneven = rng.random() < sampling.uneven
         clouds = []
         for points, normals in (
@@ -166,8 +173,29 @@ def _source(path, names, frames, read, files, single=False):
         raise ValueError(f"{path}: no scan to train on there; wanted {wanted}")
     sizes = [file.stat().st_size if file.is_file() else -1 for file in files]
     stamp = hashlib.sha256(repr((list(names), sizes)).encode()).hexdigest()
-    held = functools.lru_cache(_HELD)(read)
+
+    @functools.lru_cache(_HELD)
+    def held(row: int) -> Pair:
+        pair = read(row)
+        where = f"{path}: {pair.name}"
+        source, source_normals = _held(f"{where}: source", pair.source, pair.source_normals)
+        target, target_normals = _held(f"{where}: target", pair.target, pair.target_normals)
+        return Pair(pair.name, source, target, source_normals, target_normals, pair.transform)
+
     return SceneSource(tuple(names), tuple(frames), held, stamp, single)
+
+
+def _held(where, points, normals):
+    """What is kept in memory of a scan; raises ValueError for one that teaches nothing."""
+    few = points[:: max(1, len(points) // 256)]  # enough to see whether all lie in one place
+    if len(np.unique(few, axis=0)) < _FEWEST:
+        raise ValueError(
+            f"{where} has {len(points)} points, wanted at least {_FEWEST} in different places"
+        )
+    if len(points) > _MOST:
+        rows = np.random.default_rng(0).choice(len(points), _MOST, replace=False)
+        points, normals = points[rows], None if normals is None else normals[rows]
+    return points, normals
 
 
 def _view(

@@ -49,10 +49,12 @@ class Recipe:
     settings: Hashable
     optimizer: optax.GradientTransformation
     mesh: Mesh
-    correspondence_weight: float = 0.05
-    average_decay: float = 0.999
-    pairs_at_once: int = 1
-    precision: str = "float32"
+    correspondence_weight: float
+    average_decay: float
+    pairs_at_once: int
+    precision: str
+    max_skipped: int
+    """How many steps in a row may be left out; after more, nothing changes any more."""
 
 
 def init_state(params: dict, optimizer: optax.GradientTransformation) -> TrainState:
@@ -74,7 +76,9 @@ def train_step(state: TrainState, batch: dict, *, recipe: Recipe) -> tuple[Train
     The pairs are spread evenly over the mesh. A device accumulates the gradient of its share,
     `pairs_at_once` pairs vectorized and the rest one after the other, so that any batch fits: on
     CPU one at a time keeps the activations in cache and is fastest, an accelerator wants many. A
-    step whose gradient is not finite changes nothing but the counts of skipped steps.
+    step whose gradient is not finite changes nothing but the counts of skipped steps; once more
+    than `max_skipped` came in a row none changes anything, so that the loop, which looks but now
+    and then, finds it so.
     """
     with jax.default_matmul_precision(_of_products(recipe.precision)):
         gradient, measured = jax.shard_map(
@@ -84,7 +88,8 @@ def train_step(state: TrainState, batch: dict, *, recipe: Recipe) -> tuple[Train
             out_specs=P(),
             check_vma=False,  # derivatives written by hand say nothing of devices
         )(state.params, batch)
-    sound = jnp.isfinite(optax.tree.norm(gradient))
+    lost = state.skipped_in_row > recipe.max_skipped
+    sound = jnp.isfinite(optax.tree.norm(gradient)) & ~lost
     gradient = jax.tree.map(lambda leaf: jnp.where(sound, leaf, 0), gradient)
     updates, moments = recipe.optimizer.update(gradient, state.optimizer, state.params)
     params = optax.apply_updates(state.params, updates)
@@ -167,7 +172,7 @@ def _cloud(pair, side):
 @functools.partial(jax.jit, static_argnames=("unroll", "settings", "mesh"))
 def predict(params: dict, batch: dict, *, unroll: Unroll, settings: Hashable, mesh: Mesh) -> Array:
     """Transforms (b, L, 4, 4) of a batch that needs no training; each device takes its share, pair
-    after pair."""
+    after pair, all in float32."""
 
     def of_pair(params, pair):
         source, target = (_cloud(pair, side) for side in ("source", "target"))
@@ -176,6 +181,7 @@ def predict(params: dict, batch: dict, *, unroll: Unroll, settings: Hashable, me
     def of_share(params, pairs):
         return jax.lax.map(functools.partial(of_pair, params), pairs)
 
-    return jax.shard_map(
-        of_share, mesh=mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False
-    )(params, batch)
+    with jax.default_matmul_precision("float32"):
+        return jax.shard_map(
+            of_share, mesh=mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False
+        )(params, batch)

@@ -1,4 +1,4 @@
-"""A training asked to stop ends its step, saves, and says how it goes on."""
+"""Why a training ends early: asked to, it ends its step and saves; diverged, it says so."""
 
 from __future__ import annotations
 
@@ -17,6 +17,10 @@ class Stopped(Exception):
     def __init__(self, message: str, number: int):
         super().__init__(message)
         self.signal = number
+
+
+class Diverged(ValueError):
+    """The gradients, or what the weights answer, are no numbers any more."""
 
 
 class Requests:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -132,7 +133,7 @@ def _figure(title: str, unit: str, curves: Sequence[Curve]) -> str:
         return f"{x:.1f},{y:.1f}"
 
     drawn, legend = [], []
-    for (name, known, found), color in zip(curves, _COLORS, strict=False):
+    for (name, known, found), color in zip(curves, itertools.cycle(_COLORS), strict=False):
         points = " ".join(
             place(step, value) for step, value in zip(known, found, strict=True) if _finite(value)
         )

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
@@ -53,24 +55,24 @@ def prepare(config: Any, workdir: Path) -> Task:
     phases = tuple(_made(Phase, dict(phase), "phases") for phase in config.phases)
     for phase in phases:
         devices.check_batch(phase.batch, config.train.pairs_at_once, mesh)
-        if phase.batch % jax.process_count():
-            raise ValueError(f"batch: got {phase.batch}, wanted a multiple of the processes")
+
+    def sampling(phase, **changed):
+        # neighbors come from the host, so the network's radius is theirs
+        return Sampling(phase.points, phase.neighbors, chosen.validated.radius, **changed)
+
     samplings = tuple(
         _made(
-            Sampling,
-            {"points": phase.points, "neighbors": phase.neighbors}
-            | config.sampling.to_dict()
-            | phase.sampling,
+            functools.partial(sampling, phase),
+            config.sampling.to_dict() | phase.sampling,
             "sampling",
         )
         for phase in phases
     )
+    _check_counts(config)
     if config.train.precision not in step.PRECISIONS:
         raise ValueError(
             f"precision: got {config.train.precision!r}, wanted one of {', '.join(step.PRECISIONS)}"
         )
-    if config.train.workers < 1:
-        raise ValueError(f"workers: got {config.train.workers}, wanted at least 1")
     schedule = optimizers.make_schedule(
         config.train.schedule,
         peak_rate=config.train.peak_rate,
@@ -114,10 +116,31 @@ def prepare(config: Any, workdir: Path) -> Task:
 
 
 def fresh_params(config: Any, chosen: Learner) -> dict:
-    """The weights that a run begins with: those of `train.start_from`, or random ones."""
-    if config.train.start_from:
-        return weights.load_params(config.train.start_from, config.network)
-    return jax.jit(chosen.fresh)(jax.random.key(config.seed))
+    """The weights that a run begins with: those of `train.start_from`, or random ones.
+
+    Raises ValueError where those do not have the iterations that the config asks for.
+    """
+    key = jax.random.key(config.seed)
+    if not config.train.start_from:
+        return jax.jit(chosen.fresh)(key)
+    params = weights.load_params(config.train.start_from, config.network)
+    shapes = [jax.tree.map(jnp.shape, tree) for tree in (params, jax.eval_shape(chosen.fresh, key))]
+    if shapes[0] != shapes[1]:
+        raise ValueError(
+            f"train.start_from: {config.train.start_from} has other iterations than "
+            f"config.iterations = {config.iterations}, or shares its layer where config.shared "
+            "says otherwise (or the other way round); set both as they were"
+        )
+    return params
+
+
+def _check_counts(config):
+    for field in ("log_every", "checkpoint_every", "validate_every", "validation_pairs"):
+        if config[field] < 1:
+            raise ValueError(f"{field}: got {config[field]}, wanted at least 1")
+    for field, least in (("workers", 1), ("max_skipped", 0)):
+        if config.train[field] < least:
+            raise ValueError(f"{field}: got {config.train[field]}, wanted at least {least}")
 
 
 def _made(kind, fields, where):

@@ -7,7 +7,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from cfr_jax import metrics
-from cfr_jax.training import devices, step
+from cfr_jax.training import devices, step, stopping
 from cfr_jax.training.learner import Learner
 
 
@@ -22,10 +22,18 @@ def place(batch: dict, mesh: Mesh) -> dict:
 def validate(chosen: Learner, params: dict, placed: dict, truth: np.ndarray, mesh: Mesh) -> dict:
     """Rotation (degrees) and translation errors of the last transform against `truth` (b, 4, 4),
     their recall, and the mean rotation error of every iteration; and all transforms (b, L, 4, 4).
+
+    Raises `Diverged` where a transform is not finite.
     """
     found = step.predict(params, placed, unroll=chosen.unroll, settings=chosen.validated, mesh=mesh)
     transforms = devices.gather(found)[: len(truth)].astype(np.float64)
     truth = np.asarray(truth, np.float64)
+    lost = np.count_nonzero(~np.isfinite(transforms).all(axis=(1, 2, 3)))
+    if lost:
+        raise stopping.Diverged(
+            f"the weights' answers to {lost} of {len(truth)} validation pairs are not finite; the "
+            "last checkpoint holds those before.\nTry a lower train.peak_rate or train.clip"
+        )
     rotation = metrics.err_r(transforms[:, -1], truth)
     translation = metrics.err_t(transforms[:, -1], truth)
     return {
