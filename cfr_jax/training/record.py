@@ -29,6 +29,7 @@ def begin(config: Any, stamps: dict[str, str]) -> dict:
         "best": {},
         "validation": {},  # the last one
         "position": 0,  # pairs of the stream that were used; with the seed it decides all others
+        # of the weights begun with; a step draws nothing
         "random_key": np.asarray(jax.random.key_data(jax.random.key(config.seed))).tolist(),
         "skipped": 0,
         "clock": {"seconds": 0.0, "processor_seconds": 0.0},
