@@ -104,6 +104,28 @@ def test_an_interrupted_run_resumes_bit_for_bit(corpus_file, tmp_path, whole, ki
         assert one.get("loss") == other.get("loss")
 
 
+def test_the_weights_are_those_that_the_newest_checkpoint_calls_best(
+    corpus_file, tmp_path, whole, monkeypatch
+):
+    def killed(*_):
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(weights, "save_params", killed)
+        with pytest.raises(Killed):
+            run(config(corpus_file), tmp_path)
+    assert not (tmp_path / "weights.safetensors").exists()
+    assert int(state_of(tmp_path).step) == 4  # the checkpoint came first
+
+    given = config(corpus_file)
+    given.phases = ({"steps": 4, "points": 24, "neighbors": 6, "batch": 2},)
+    best = run(given, tmp_path)  # nothing is left to do but this
+
+    assert best["step"] == 4
+    made = weights.load_params(tmp_path / "weights.safetensors")
+    assert_same(made, state_of(tmp_path).average)
+
+
 def test_seconds_add_up_over_restarts(corpus_file, tmp_path, killed_in_step):
     killed_in_step(11)
     with pytest.raises(Killed):

@@ -68,11 +68,13 @@ class _Training:
     def go_to_the_end(self) -> None:
         if self.config.train.start_from and self.about["step"] == 0:
             self._validate()
+        self._keep_best()  # or it was killed between a checkpoint and its weights
         with stopping.stop_requests() as requests:
             for phase, ran in remaining(self.task.phases, self.about["step"]):
                 self._go_through(phase, ran, requests)
         if not self.about["best"]:  # all steps were done, and the validation pairs are others now
             self._validate()
+            self._keep_best()
         self._take_note()
 
     def _go_through(self, phase: Phase, ran: int, requests: stopping.Requests) -> None:
@@ -118,6 +120,8 @@ class _Training:
             if saving:
                 self._take_note()
                 self.checkpoints.save(self.state, about.copy(), best=about["best"].get("step"))
+            if validating:
+                self._keep_best()
             if requests.received:
                 self.checkpoints.wait()
                 raise stopping.Stopped(
@@ -137,10 +141,16 @@ class _Training:
         about["validation"] = {"step": about["step"], **found}
         if found["rotation_mean"] < about["best"].get("rotation_mean", np.inf):
             about["best"] = about["validation"]
-            if devices.is_first():
-                notes = record.notes(self.config, about)
-                weights.save_params(self.workdir / record.WEIGHTS, self.state.average, notes)
         self.reports.resume()
+
+    def _keep_best(self) -> None:
+        """Writes the weights where they are the best so far, after the checkpoint that says so."""
+        if self.about["best"].get("step") != self.about["step"]:
+            return
+        self.checkpoints.wait()
+        if devices.is_first():
+            notes = record.notes(self.config, self.about)
+            weights.save_params(self.workdir / record.WEIGHTS, self.state.average, notes)
 
     def _take_note(self) -> None:
         self.about |= {"clock": self.reports.clock.read(), "skipped": int(self.state.skipped)}
