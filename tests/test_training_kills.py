@@ -56,7 +56,7 @@ def test_a_run_killed_at_random_moments_ends_bit_equal(tmp_path):
         process = start(given, killed)
         # a moment among the steps, not while it still starts and compiles
         wait_for_checkpoint(process, killed, after=reached[-1])
-        time.sleep(chance.uniform(0, stepping / KILLS))
+        time.sleep(chance.uniform(0, stepping / (2 * KILLS)))
         process.send_signal(signal.SIGKILL)
         process.communicate()
         reached.append(newest(killed))

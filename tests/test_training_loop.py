@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 
 import jax
@@ -16,6 +15,7 @@ from cfr_jax.data.augment import Sampling
 from cfr_jax.training import devices, learner, loop, optimizers, step, stopping, validation
 from cfr_jax.training.board import Board
 from cfr_jax.training.checkpoints import Checkpoints, SaveError
+from cfr_jax.training.reports import Reports
 from cfr_jax.training.stopping import Stopped
 from cfr_jax.training.task import fresh_params, prepare
 
@@ -308,16 +308,49 @@ def test_the_last_steps_are_told_though_they_are_fewer(corpus_file, tmp_path):
     assert [line["step"] for line in lines_of(tmp_path) if "loss" in line] == [5, 10, 15, 16]
 
 
-def test_a_finished_run_is_validated_anew_on_other_pairs(corpus_file, whole, tmp_path, capsys):
-    folder = shutil.copytree(whole[0], tmp_path / "finished")
+def test_a_finished_run_stays_as_it_is_whatever_the_command_says_now(corpus_file, whole):
+    file = whole[0] / "weights.safetensors"
+    before = file.read_bytes()
     changed = config(corpus_file)
-    changed.validation_pairs = 3
+    changed.validation_pairs, changed.train.peak_rate = 3, 1e-4
 
-    best = run(changed, folder)
+    assert run(changed, whole[0]) == whole[1]
 
-    assert best["step"] == 16 and "best so far is forgotten" in capsys.readouterr().out
-    made = weights.read_weights(folder / "weights.safetensors")
-    assert json.loads(made.notes["validation"]) == best
+    assert file.read_bytes() == before
+
+
+def test_a_run_cut_short_before_its_first_validation_is_validated(
+    corpus_file, tmp_path, killed_in_step
+):
+    given = config(corpus_file)
+    given.validate_every = 100
+    killed_in_step(6)
+    with pytest.raises(Killed):
+        run(given, tmp_path)
+    given.phases = ({"steps": 4, "points": 24, "neighbors": 6, "batch": 2},)
+
+    best = run(given, tmp_path)
+
+    made = weights.read_weights(tmp_path / "weights.safetensors")
+    assert best["step"] == 4 and json.loads(made.notes["validation"]) == best
+
+
+def test_asked_to_stop_while_it_logs_it_saves_before_it_stops(corpus_file, tmp_path, monkeypatch):
+    measured = Reports.measured
+
+    def asked(self, done, skipped):
+        measured(self, done, skipped)
+        if done == 5:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Reports, "measured", asked)
+    given = config(corpus_file)
+    given.log_every, given.checkpoint_every, given.validate_every = 5, 100, 100
+
+    with pytest.raises(Stopped, match="all saved"):
+        run(given, tmp_path)
+
+    assert int(state_of(tmp_path).step) == 6
 
 
 def test_weights_to_start_from_have_the_iterations_that_are_asked_for(corpus_file, whole):
@@ -369,7 +402,9 @@ def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monk
         ({"log_every": 0}, "log_every: got 0"),
         ({"validation_pairs": 0}, "validation_pairs: got 0"),
         ({"settings": {"neighbors": 5}}, "settings: got neighbors, wanted some of .*radius"),
-        ({"sampling.radius": 0.2}, "sampling: .*radius"),
+        ({"sampling.radius": 0.2}, "sampling: got radius; .* the radius in config.settings"),
+        ({"network": "rpmnet", "settings": {"radius": 0.2}}, "settings: got radius, wanted none"),
+        ({"keep_checkpoints": 0}, "keep_checkpoints: got 0"),
         ({"data.train": "nowhere.h5"}, "nowhere.h5"),
         ({"sampling.keep": (0.0, 2.0)}, "keep"),
         ({"sampling.keep": (0.5, 0.3)}, "keep: got .*the lower one first"),

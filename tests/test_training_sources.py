@@ -222,13 +222,16 @@ def test_scans_of_too_few_points_are_named_before_any_training(tmp_path, surface
     scans = tmp_path / "scans"
     scans.mkdir()
     io.write(scans / "good.ply", io.PointCloud(surface))
-    io.write(scans / "few.ply", io.PointCloud(surface[:3]))
+    for folder in ("a", "b"):  # of one name, they are two
+        (scans / folder).mkdir()
+        io.write(scans / folder / "few.ply", io.PointCloud(surface[:3]))
     io.write(scans / "same.ply", io.PointCloud(np.ones((500, 3))))
     about = {"kind": "scans", "path": str(scans)}
     mixture = sources.open_mixture(given(mine=about), tmp_path, "data.train")
 
     with pytest.raises(
-        ValueError, match=r"2 scans cannot be used.*\n.*few\.ply.* 3 points.*\n.*same\.ply.* 500"
+        ValueError,
+        match=r"3 scans .*\n.*a/few\.ply has 3 .*\n.*b/few\.ply has 3 .*\n.*same\.ply has 500",
     ):
         sources.check_readable(mixture, tmp_path, "data.train")
 
@@ -242,7 +245,7 @@ def test_a_pair_that_cannot_be_drawn_is_named():
         source.draw(0, WHOLE, np.random.default_rng(0))
 
 
-def test_of_a_scan_of_many_points_no_more_are_held_than_thinning_looks_at(tmp_path):
+def test_of_a_scan_of_many_points_only_some_are_held(tmp_path):
     rng = np.random.default_rng(0)
     points = rng.normal(size=(3 * scenes._MOST, 3))
     io.write(tmp_path / "big.ply", io.PointCloud(points, normals=points))
@@ -253,6 +256,7 @@ def test_of_a_scan_of_many_points_no_more_are_held_than_thinning_looks_at(tmp_pa
     directions = pair.source / np.linalg.norm(pair.source, axis=1, keepdims=True)
     alike = np.einsum("ni,ni->n", directions, pair.source_normals)
     assert (alike > 0.99).all()  # each point keeps its own
+    assert pair.target is pair.source
 
 
 def test_the_stamp_of_data_goes_by_what_they_are_and_not_by_where_they_lie(tmp_path, surface):

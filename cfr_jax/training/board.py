@@ -9,14 +9,13 @@ from __future__ import annotations
 import importlib.util
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cfr_jax.losses import PairLoss
+from cfr_jax.training.log import writing
 from cfr_jax.viewer.picture import write_picture
 from cfr_jax.viewer.scene import Scene
 
@@ -41,12 +40,15 @@ class Board:
         if importlib.util.find_spec("tensorboardX") is None:
             self.missing = MISSING
             return
-        if importlib.util.find_spec("matplotlib") is None:
+        self._draws = importlib.util.find_spec("matplotlib") is not None
+        if not self._draws:
             self.missing = NO_PICTURES
+        from tensorboardX import summary
         from tensorboardX.event_file_writer import EventsWriter
-        from tensorboardX.proto.event_pb2 import SessionLog
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
 
-        with self._writing():
+        self._summary, self._event = summary, Event
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             self._events = EventsWriter(str(folder / "events"))
             # what an interrupted run wrote after its last checkpoint is hidden
@@ -56,64 +58,51 @@ class Board:
         """The line of the journal, and how alpha and beta are spread over the pairs."""
         if self._events is None:
             return
-        from tensorboardX import summary
-
-        with self._writing():
+        step = line["step"]
+        with writing(self._folder):
             for name in _SCALARS:
                 if name in line:  # there are no means where no pair was sound
-                    self._scalar(f"training/{name}", line[name], line["step"])
+                    self._scalar(f"training/{name}", line[name], step)
             for name in ("rotation_error", "translation_error"):
                 for i, value in enumerate(line.get(name, ()), start=1):
-                    self._scalar(f"training/{name}/{i}", value, line["step"])
+                    self._scalar(f"training/{name}/{i}", value, step)
             for name in ("alpha", "beta"):
-                spread = np.concatenate([np.asarray(getattr(step, name)) for step in measured])
+                spread = np.concatenate([np.asarray(getattr(each, name)) for each in measured])
                 for i, values in enumerate(spread.T, start=1):
                     if np.isfinite(values).all():
-                        drawn = summary.histogram(f"{name}/{i}", values, _BINS)
-                        self._add(line["step"], summary=drawn)
+                        drawn = self._summary.histogram(f"{name}/{i}", values, _BINS)
+                        self._add(step, summary=drawn)
             self._events.flush()
 
     def validation(self, step: int, found: dict, pictures: list[tuple[str, Scene]]) -> None:
         """Errors, and pairs as the network laid them."""
         if self._events is None:
             return
-        from tensorboardX import summary
-
-        with self._writing():
+        drawn = [
+            self._summary.image(f"validation/{name}", _pixels(scene), dataformats="HWC")
+            for name, scene in pictures
+            if self._draws
+        ]
+        with writing(self._folder):
             for name in _VALIDATIONS:
                 self._scalar(f"validation/{name}", found[name], step)
             for i, value in enumerate(found["rotation_by_iteration"], start=1):
                 self._scalar(f"validation/rotation/{i}", value, step)
-            for name, scene in pictures if self.missing is None else ():
-                drawn = summary.image(f"validation/{name}", _pixels(scene), dataformats="HWC")
-                self._add(step, summary=drawn)
+            for picture in drawn:
+                self._add(step, summary=picture)
             self._events.flush()
 
     def close(self) -> None:
         """Ends the file."""
         if self._events is not None:
-            with self._writing():
+            with writing(self._folder):
                 self._events.close()
 
     def _scalar(self, name, value, step):
-        from tensorboardX import summary
-
-        self._add(step, summary=summary.scalar(name, value))
+        self._add(step, summary=self._summary.scalar(name, value))
 
     def _add(self, step, **content):
-        from tensorboardX.proto.event_pb2 import Event
-
-        self._events.write_event(Event(step=step, wall_time=time.time(), **content))
-
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise OSError(
-                f"{self._folder} could not be written ({error.strerror}); make room, then run the "
-                "same command again"
-            ) from error
+        self._events.write_event(self._event(step=step, wall_time=time.time(), **content))
 
 
 def _pixels(scene: Scene) -> np.ndarray:

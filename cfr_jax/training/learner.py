@@ -61,6 +61,8 @@ def learner(config: Any) -> Learner:
             validated=prepared.Settings(**changed),
         )
     if config.network == "rpmnet":
+        if changed := dict(config.get("settings", {})):
+            raise ValueError(f"settings: got {', '.join(changed)}, wanted none for rpmnet")
         return Learner(
             fresh=rpmnet.init_params,
             unroll=rpmnet.unroll,

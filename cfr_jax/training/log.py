@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +50,18 @@ class Clock:
         return np.array([time.perf_counter(), time.process_time()])
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Within, an OSError says what could not be written and what to do."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(
+            f"{path} could not be written ({error.strerror or error}); make room, then run the "
+            "same command again"
+        ) from error
+
+
 class Journal:
     """`metrics.jsonl`: an object a line, appended; read again when a run goes on."""
 
@@ -60,14 +74,8 @@ class Journal:
 
     def write(self, line: dict) -> None:
         """Appends one line. Raises OSError, naming the file, where that cannot be written."""
-        try:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(line, allow_nan=False) + "\n")
-        except OSError as error:
-            raise OSError(
-                f"{self.path} could not be written ({error.strerror}); make room, then run the "
-                "same command again"
-            ) from error
+        with writing(self.path), self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line, allow_nan=False) + "\n")
 
 
 def read_journal(path: Path) -> list[dict]:

@@ -68,11 +68,11 @@ class _Training:
     def go_to_the_end(self) -> None:
         if self.config.train.start_from and self.about["step"] == 0:
             self._validate()
-        self._keep_best()  # or it was killed between a checkpoint and its weights
+        self._keep_best()  # a kill may have come between a checkpoint and its weights
         with stopping.stop_requests() as requests:
             for phase, ran in remaining(self.task.phases, self.about["step"]):
                 self._go_through(phase, ran, requests)
-        if not self.about["best"]:  # all steps were done, and the validation pairs are others now
+        if not self.about["best"]:  # stopped before its first validation, and cut short since
             self._validate()
             self._keep_best()
         self._take_note()
@@ -108,9 +108,10 @@ class _Training:
             done = about["step"] = about["step"] + 1
             about["position"] += phase.batch
             self.reports.step(done, measured)
-            logging = done % config.log_every == 0 or done == task.steps
-            validating = done % config.validate_every == 0 or done == task.steps
-            saving = validating or done % config.checkpoint_every == 0 or requests.received
+            last, asked = done == task.steps, requests.received
+            logging = last or done % config.log_every == 0
+            validating = last or done % config.validate_every == 0
+            saving = validating or done % config.checkpoint_every == 0 or asked
             if logging:
                 self.reports.measured(done, int(self.state.skipped))
             if logging or saving:
@@ -122,12 +123,12 @@ class _Training:
                 self.checkpoints.save(self.state, about.copy(), best=about["best"].get("step"))
             if validating:
                 self._keep_best()
-            if requests.received:
+            if asked:
                 self.checkpoints.wait()
                 raise stopping.Stopped(
                     f"stopped at step {done} of {task.steps}, all saved; "
                     "the same command goes on from there",
-                    requests.received,
+                    asked,
                 )
 
     def _validate(self) -> None:
@@ -144,13 +145,16 @@ class _Training:
         self.reports.resume()
 
     def _keep_best(self) -> None:
-        """Writes the weights where they are the best so far, after the checkpoint that says so."""
+        """Writes the weights where they are the best so far and not yet in their file, after the
+        checkpoint that says so."""
         if self.about["best"].get("step") != self.about["step"]:
             return
+        self.reports.pause()
         self.checkpoints.wait()
-        if devices.is_first():
-            notes = record.notes(self.config, self.about)
-            weights.save_params(self.workdir / record.WEIGHTS, self.state.average, notes)
+        file, notes = self.workdir / record.WEIGHTS, record.notes(self.config, self.about)
+        if devices.is_first() and not record.holds(file, self.about["best"]):
+            weights.save_params(file, self.state.average, notes)
+        self.reports.resume()
 
     def _take_note(self) -> None:
         self.about |= {"clock": self.reports.clock.read(), "skipped": int(self.state.skipped)}
@@ -160,6 +164,6 @@ def _stop_if_diverged(in_row: int, done: int, most: int) -> None:
     if in_row > most:
         raise stopping.Diverged(
             f"by step {done}, more than train.max_skipped = {most} steps in a row had gradients "
-            "that are not finite; the last checkpoint holds sound weights.\n"
+            "that are not finite; the last checkpoint, if there is one, holds sound weights.\n"
             "Try a lower train.peak_rate or train.clip, and look for broken shapes in the data"
         )

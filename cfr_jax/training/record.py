@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from cfr_jax import __version__
+from cfr_jax import __version__, weights
 
 _NAMED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 WEIGHTS = "weights.safetensors"  # the best so far
@@ -43,7 +43,7 @@ def begin(config: Any, stamps: dict[str, str]) -> dict:
 def go_on(before: dict, now: dict, total: int, workdir: Path) -> list[str]:
     """Takes over into `now` what a checkpoint says; words about where it goes on, and what changed.
 
-    The best validation is forgotten where another follows on other pairs: they do not compare.
+    The best validation is forgotten where others follow on other pairs: they do not compare.
     Raises ValueError where the checkpoint's training was on other data, whose order of pairs means
     nothing here.
     """
@@ -59,7 +59,7 @@ def go_on(before: dict, now: dict, total: int, workdir: Path) -> list[str]:
     told = [f"going on from step {done}"] if done < total else []
     if changed:
         told.append(f"the config differs from the checkpoint's: {'; '.join(changed)}")
-    if before["data"]["data.validation"] != now["data"]["data.validation"]:
+    if done < total and before["data"]["data.validation"] != now["data"]["data.validation"]:
         now["best"] = {}
         told.append("data.validation holds other pairs than before: the best so far is forgotten")
     if done >= total:
@@ -74,6 +74,14 @@ def notes(config: Any, about: dict) -> dict[str, str]:
         "validation": json.dumps(about["best"]),
         "made_by": f"cfr_jax {__version__} train.py",
     }
+
+
+def holds(file: Path, best: dict) -> bool:
+    """Whether this weights file is there, sound, and that of the validation `best`."""
+    try:
+        return weights.read_weights(file).notes.get("validation") == json.dumps(best)
+    except ValueError:
+        return False
 
 
 def _changes(before: dict, now: dict) -> Iterator[str]:

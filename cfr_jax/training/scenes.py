@@ -23,7 +23,7 @@ from cfr_jax.data.pairs import CsvPairs, Hdf5Pairs, Pair, among, open_pairs
 from cfr_jax.data.protocol import crop
 
 _HELD = 128  # pairs in memory: reading one takes longer than drawing from it
-_MOST = 1 << 16  # points of a cloud in memory, at random: thinning looks at no more
+_MOST = 1 << 16  # points of a cloud in memory, drawn at random: scans of any size then fit
 _FEWEST = 16  # points that differ: of fewer, crops and neighborhoods are no surfaces
 Frames = tuple[int, int] | None
 """Only pairs whose frames both are at least the first and below the second; None: all."""
@@ -48,8 +48,9 @@ class SceneSource:
 
     def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
         """A crop and a draw of points of each cloud, in the unit sphere."""
+        pair = self.read(index)
         try:
-            return self._draw(self.read(index), sampling, rng)
+            return self._draw(pair, sampling, rng)
         except ValueError as error:
             raise ValueError(f"{self.names[index]}: {error}") from error
 
@@ -177,10 +178,13 @@ def _source(path, names, frames, read, files, single=False):
     @functools.lru_cache(_HELD)
     def held(row: int) -> Pair:
         pair = read(row)
-        where = f"{path}: {pair.name}"
-        source, source_normals = _held(f"{where}: source", pair.source, pair.source_normals)
-        target, target_normals = _held(f"{where}: target", pair.target, pair.target_normals)
-        return Pair(pair.name, source, target, source_normals, target_normals, pair.transform)
+        where = f"{path}: {names[row]}"
+        source = target = _held(
+            where if single else f"{where}: source", pair.source, pair.source_normals
+        )
+        if not single:
+            target = _held(f"{where}: target", pair.target, pair.target_normals)
+        return Pair(pair.name, source[0], target[0], source[1], target[1], pair.transform)
 
     return SceneSource(tuple(names), tuple(frames), held, stamp, single)
 

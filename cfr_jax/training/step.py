@@ -36,7 +36,7 @@ class TrainState:
     """Exponential moving average of the parameters: what is validated and shipped."""
     optimizer: optax.OptState
     skipped: Int[Array, ""]
-    """Steps left out because their gradient was not finite."""
+    """Steps left out because their gradient was not finite, or came after too many such."""
     skipped_in_row: Int[Array, ""]
     """How many of them came last, one after the other."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -56,16 +55,8 @@ def prepare(config: Any, workdir: Path) -> Task:
     for phase in phases:
         devices.check_batch(phase.batch, config.train.pairs_at_once, mesh)
 
-    def sampling(phase, **changed):
-        # neighbors come from the host, so the network's radius is theirs
-        return Sampling(phase.points, phase.neighbors, chosen.validated.radius, **changed)
-
     samplings = tuple(
-        _made(
-            functools.partial(sampling, phase),
-            config.sampling.to_dict() | phase.sampling,
-            "sampling",
-        )
+        _sampling(phase, chosen.validated.radius, config.sampling.to_dict() | phase.sampling)
         for phase in phases
     )
     _check_counts(config)
@@ -135,12 +126,24 @@ def fresh_params(config: Any, chosen: Learner) -> dict:
 
 
 def _check_counts(config):
-    for field in ("log_every", "checkpoint_every", "validate_every", "validation_pairs"):
+    counts = "log_every", "checkpoint_every", "validate_every", "validation_pairs"
+    for field in (*counts, "keep_checkpoints"):
         if config[field] < 1:
             raise ValueError(f"{field}: got {config[field]}, wanted at least 1")
     for field, least in (("workers", 1), ("max_skipped", 0)):
         if config.train[field] < least:
             raise ValueError(f"{field}: got {config.train[field]}, wanted at least {least}")
+
+
+def _sampling(phase, radius, fields):
+    # neighbors are found on the host: within the network's radius, as many as the phase says
+    if wrong := fields.keys() & {"points", "neighbors", "radius"}:
+        raise ValueError(
+            f"sampling: got {', '.join(sorted(wrong))}; points and neighbors stand in a phase, the "
+            "radius in config.settings"
+        )
+    given = {"points": phase.points, "neighbors": phase.neighbors, "radius": radius}
+    return _made(Sampling, given | fields, "sampling")
 
 
 def _made(kind, fields, where):

@@ -31,8 +31,8 @@ def validate(chosen: Learner, params: dict, placed: dict, truth: np.ndarray, mes
     lost = np.count_nonzero(~np.isfinite(transforms).all(axis=(1, 2, 3)))
     if lost:
         raise stopping.Diverged(
-            f"the weights' answers to {lost} of {len(truth)} validation pairs are not finite; the "
-            "last checkpoint holds those before.\nTry a lower train.peak_rate or train.clip"
+            f"the weights' answers to {lost} of {len(truth)} validation pairs are not finite.\n"
+            "Look for broken shapes among these pairs, or try a lower train.peak_rate"
         )
     rotation = metrics.err_r(transforms[:, -1], truth)
     translation = metrics.err_t(transforms[:, -1], truth)
