@@ -51,7 +51,7 @@ def main(_) -> None:
     try:
         if not _COORDINATOR.value:
             # what a phase lacks is said by `run`
-            batches = (phase.get("batch", 1) for phase in _CONFIG.value.phases)
+            batches = (phase.get("batch", 1) for phase in _CONFIG.value.get("phases", ()))
             cores = devices.of_cores(*batches)
             if cores is not None:
                 jax.config.update("jax_num_cpu_devices", cores)

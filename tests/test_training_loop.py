@@ -421,6 +421,16 @@ def test_what_a_config_has_wrong_is_named(corpus_file, tmp_path, change, wanted)
         loop.run(given, tmp_path)
 
 
+def test_a_config_that_lacks_fields_is_told_which(corpus_file, tmp_path):
+    given = config(corpus_file)
+    del given.seed, given.train.clip, given.data
+
+    with pytest.raises(
+        ValueError, match="lacks seed, data.train, data.validation, train.clip; .*open_cad.py"
+    ):
+        prepare(given, tmp_path)
+
+
 def test_a_phase_may_be_sampled_in_its_own_way(corpus_file, tmp_path):
     given = config(corpus_file)
     given.phases[1]["sampling"] = {"estimated_normals": 1.0}

@@ -18,6 +18,15 @@ from cfr_jax.data.build import ENOUGH
 from cfr_jax.training import devices, optimizers, sources, step
 from cfr_jax.training.learner import Learner, Phase, learner
 
+_FIELDS = (
+    "seed", "network", "iterations", "data.train", "data.validation", "phases", "sampling",
+    "train.optimizer", "train.schedule", "train.peak_rate", "train.warmup", "train.cooldown",
+    "train.clip", "train.weight_decay", "train.correspondence_weight", "train.average_decay",
+    "train.precision", "train.pairs_at_once", "train.max_skipped", "train.workers",
+    "train.start_from", "log_every", "checkpoint_every", "validate_every", "validation_pairs",
+    "keep_checkpoints",
+)  # fmt: skip
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Task:
@@ -50,6 +59,7 @@ def prepare(config: Any, workdir: Path) -> Task:
     Raises ValueError, naming the field, where the config cannot be used, the data cannot be read,
     or training and validation share a scan.
     """
+    _check_fields(config)
     chosen, mesh = learner(config), devices.make_mesh()
     phases = tuple(_made(Phase, dict(phase), "phases") for phase in config.phases)
     for phase in phases:
@@ -59,7 +69,6 @@ def prepare(config: Any, workdir: Path) -> Task:
         _sampling(phase, chosen.validated.radius, config.sampling.to_dict() | phase.sampling)
         for phase in phases
     )
-    _check_counts(config)
     if config.train.precision not in step.PRECISIONS:
         raise ValueError(
             f"precision: got {config.train.precision!r}, wanted one of {', '.join(step.PRECISIONS)}"
@@ -125,7 +134,15 @@ def fresh_params(config: Any, chosen: Learner) -> dict:
     return params
 
 
-def _check_counts(config):
+def _check_fields(config):
+    def lacks(name):
+        room, _, field = name.rpartition(".")
+        return field not in (config.get(room, {}) if room else config)
+
+    if lacking := [name for name in _FIELDS if lacks(name)]:
+        raise ValueError(
+            f"config: lacks {', '.join(lacking)}; configs/open_cad.py says what they are"
+        )
     counts = "log_every", "checkpoint_every", "validate_every", "validation_pairs"
     for field in (*counts, "keep_checkpoints"):
         if config[field] < 1:
