@@ -12,8 +12,8 @@ def unfinished(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A name beside `path` to write to; it becomes `path` once the block ends without an error, so
     that no reader sees half a file."""
     path = Path(path)
-    # processes on several machines may share a folder, and their numbers
-    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    # no process number: processes on several machines may share a folder
+    beside = path.with_name(f".{uuid.uuid4().hex}.tmp")
     try:
         yield beside
         os.replace(beside, path)

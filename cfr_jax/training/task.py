@@ -64,7 +64,6 @@ def prepare(config: Any, workdir: Path) -> Task:
     phases = tuple(_made(Phase, dict(phase), "phases") for phase in config.phases)
     for phase in phases:
         devices.check_batch(phase.batch, config.train.pairs_at_once, mesh)
-
     samplings = tuple(
         _sampling(phase, chosen.validated.radius, config.sampling.to_dict() | phase.sampling)
         for phase in phases
