@@ -1,6 +1,6 @@
 """A long training on the open CAD corpus: the data and augmentation of `open_cad.py`.
 
-Some five hours on two cores. A restart costs nothing but the steps since the last checkpoint, so
+Some ten hours on two cores. A restart costs nothing but the steps since the last checkpoint, so
 the run may be made in pieces.
 """
 
@@ -22,7 +22,7 @@ def get_config() -> ConfigDict:
         {"steps": 6000, "points": 256, "neighbors": 24, "batch": 8},
         {"steps": 4750, "points": 358, "neighbors": 32, "batch": 8},
         {"steps": 5250, "points": 358, "neighbors": 32, "batch": 8, "sampling": estimated},
-        {"steps": 1800, "points": 717, "neighbors": 64, "batch": 8, "sampling": estimated},
+        {"steps": 10800, "points": 717, "neighbors": 64, "batch": 8, "sampling": estimated},
     )
     config.train.optimizer = "muon"
     config.train.schedule = "wsd"
