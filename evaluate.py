@@ -11,7 +11,7 @@ from pathlib import Path
 from absl import flags, logging
 from ml_collections import config_flags
 
-from cfr_jax.cli import configured
+from cfr_jax.cli.shared import configured
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "The data, the methods, their settings.")
 _OUT = flags.DEFINE_string("out", None, "Folder for results.json, table.md, plots and gallery.")

@@ -26,7 +26,7 @@ from pathlib import Path
 from absl import flags, logging
 from ml_collections import config_flags
 
-from cfr_jax.cli import configured
+from cfr_jax.cli.shared import configured
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "What to train, on what, and how long.")
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of checkpoints, metrics and weights.")
@@ -41,8 +41,9 @@ def main(_) -> None:
     """Everything of interest is in `cfr_jax.training.loop`."""
     import jax
 
-    from cfr_jax.cli.cache import keep_compiled_programs
-    from cfr_jax.training import devices, loop, record, stopping, validation
+    from cfr_jax.cli.shared.cache import keep_compiled_programs
+    from cfr_jax.training import devices, loop, stopping, validation
+    from cfr_jax.training.reporting import record
 
     # orbax writes pages about a full disk; what went wrong is said below, once
     logging.set_verbosity(logging.FATAL)

@@ -16,9 +16,11 @@ import jax.numpy as jnp
 from timing import compiled, program
 
 import cfr_jax as cfr
-from cfr_jax import iterations, registration, rigid, rpmnet, sinkhorn
-from cfr_jax.features import raw_features
-from cfr_jax.neighbors import nearest, nearest_on_host
+from cfr_jax.geometry import rigid
+from cfr_jax.geometry.neighbors import nearest, nearest_on_host
+from cfr_jax.networks import rpmnet, sinkhorn
+from cfr_jax.networks.cfr import iterations, registration
+from cfr_jax.networks.features import raw_features
 
 Call = Callable[[], object]
 PAPER = 717

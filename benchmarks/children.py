@@ -33,7 +33,7 @@ def start_up(runs: int) -> dict:
     """Seconds of `cfr register` on the demo pair, its cache warm, beside a process that imports JAX
     and adds three numbers; alternating, medians."""
     folder = Path(cfr.__file__).parent
-    pair = [str(folder / "demo" / f"{name}.ply") for name in ("source", "target")]
+    pair = [str(folder / "cli" / "demo_pair" / f"{name}.ply") for name in ("source", "target")]
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"CFR_JAX_CACHE": cache}
         environment["PYTHONPATH"] = str(folder.parent)

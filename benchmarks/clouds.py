@@ -16,7 +16,7 @@ _NOISE = 0.002  # of the radius: no two points agree where a view is drawn from 
 @functools.cache
 def pair(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Source and target, (count, 3) float32 in the unit sphere; the same ones every time."""
-    folder = Path(cfr.__file__).parent / "demo"
+    folder = Path(cfr.__file__).parent / "cli" / "demo_pair"
     rng = np.random.default_rng(count)
     clouds = []
     for name in ("source", "target"):

@@ -9,7 +9,8 @@ of these five turned either way about each axis instead of one; two keep only ha
 (one with estimated normals); one is turned by any rotation and searched globally; one is turned by
 up to 90 degrees about each axis and is not; and one is of two different shapes.
 
-The first form cross-validates by shape, then fits to all pairs and writes cfr_jax/calibration.py.
+The first form cross-validates by shape, then fits to all pairs and writes
+cfr_jax/networks/calibration.py.
 The second measures what ships on shapes that it was not fitted to, and draws. `--clues FILE.npz`
 keeps what was gathered: a call that was cut off goes on from there.
 """
@@ -27,10 +28,10 @@ import tqdm
 from scipy.optimize import minimize
 
 from benchmarks import reliability
-from cfr_jax import calibration, confidence, metrics, solving
-from cfr_jax.alignment import align
-from cfr_jax.atomic import write_atomically
-from cfr_jax.cli.cache import keep_compiled_programs
+from cfr_jax.alignment import confidence, solving
+from cfr_jax.alignment.align import align
+from cfr_jax.alignment.planning import SETTINGS, planned
+from cfr_jax.cli.shared.cache import keep_compiled_programs
 from cfr_jax.data.corpus import Corpus, read_corpus
 from cfr_jax.data.protocol import (
     low_overlap,
@@ -39,11 +40,14 @@ from cfr_jax.data.protocol import (
     partial_both_ways,
     random_pair,
 )
-from cfr_jax.planning import SETTINGS, planned
-from cfr_jax.registration import prepare, register
-from cfr_jax.weights import load_params
+from cfr_jax.evaluation import metrics
+from cfr_jax.networks import calibration
+from cfr_jax.networks.cfr.registration import prepare, register
+from cfr_jax.networks.clues import NetworkClues
+from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.weights.files import load_params
 
-OF_NETWORK = tuple(field.name for field in dataclasses.fields(confidence.NetworkClues))
+OF_NETWORK = tuple(field.name for field in dataclasses.fields(NetworkClues))
 OF_SURFACES = tuple(f.name for f in dataclasses.fields(confidence.Clues) if f.name != "network")
 CLUES = OF_NETWORK + OF_SURFACES
 USED = {"REGISTER": OF_NETWORK, "ALIGN": CLUES}
@@ -158,7 +162,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--clues", type=Path, help="keep what is gathered in this .npz")
-    parser.add_argument("--fit", action="store_true", help="write cfr_jax/calibration.py")
+    parser.add_argument("--fit", action="store_true", help="write cfr_jax/networks/calibration.py")
     parser.add_argument("--figure", type=Path, help="draw reliability and rejection")
     args = parser.parse_args()
     keep_compiled_programs()
@@ -176,7 +180,7 @@ def main() -> None:
 
 
 def _write_calibration(found: Gathered) -> None:
-    lines = [confidence.calibration.__doc__.rstrip("\n")]
+    lines = [calibration.__doc__.rstrip("\n")]
     text = f'"""{lines[0]}\n"""\n'
     for name, clues in USED.items():
         fitted = fit(found.clues[name], found.right[name])

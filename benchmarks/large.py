@@ -82,7 +82,7 @@ def registered(source: np.ndarray, target: np.ndarray) -> dict:
     import jax
 
     import cfr_jax as cfr
-    from cfr_jax.neighbors import nearest_on_host
+    from cfr_jax.geometry.neighbors import nearest_on_host
 
     settings, params = cfr.Settings(), cfr.load_params()
     began = time.perf_counter()

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cfr_jax.data.furniture import FurnitureLibrary
-from cfr_jax.data.packages import extract
+from cfr_jax.data.making.furniture import FurnitureLibrary
+from cfr_jax.data.making.packages import extract
 from cfr_jax.io.mesh import Mesh
 
 PIECE = "Blend Swap CC-0#forkLift"

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cfr_jax.data.furniture import FurnitureLibrary
-from cfr_jax.data.open_cad import UNSEEN, category_of
-from cfr_jax.data.packages import extract
-from cfr_jax.data.shapes import make_shape
+from cfr_jax.data.making.furniture import FurnitureLibrary
+from cfr_jax.data.making.open_cad import UNSEEN, category_of
+from cfr_jax.data.making.packages import extract
+from cfr_jax.data.making.shapes import make_shape
 
 LIBRARY = "usr/share/sweethome3d/furniture/BlendSwap-CC-0.sh3f"
 STEM = "BlendSwap-CC-0"

@@ -12,15 +12,16 @@ import argparse
 import datetime
 import json
 
-from cfr_jax import __version__, cards, reproduction
-from cfr_jax.atomic import write_atomically
-from cfr_jax.evaluation import machine
-from cfr_jax.progress import Progress
-from cfr_jax.weights import load_params
+from cfr_jax import __version__
+from cfr_jax.evaluation import machine, reproduction
+from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.runtime.progress import Progress
+from cfr_jax.weights import cards
+from cfr_jax.weights.files import load_params
 
 
 def main() -> None:
-    """Updates `cfr_jax/models/NAME.json`."""
+    """Updates `cfr_jax/weights/shipped/NAME.json`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("name", help="of the weights and their card")
     path = cards.FOLDER / f"{parser.parse_args().name}.json"

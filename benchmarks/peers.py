@@ -29,8 +29,8 @@ _KNOWN = {"cfenet": "CFR, the authors' PyTorch", "rpmnet": "RPM-Net, its authors
 
 
 def installed() -> Iterator[tuple[str, dict]]:
-    """Names of `cfr_jax.baselines` that can be used here, with options for the unit sphere."""
-    from cfr_jax.baselines.optional import require
+    """Names of `evaluation.baselines` that can be used here, with options for the unit sphere."""
+    from cfr_jax.runtime.optional import require
 
     local = {"distances": (0.2, 0.1, 0.05), "start": "centroid"}
     features = {"distance": 0.05, "normal_radius": 0.2, "feature_radius": 0.3}

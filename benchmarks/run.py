@@ -25,8 +25,8 @@ import report
 from timing import Line, Roof, measure
 
 import cfr_jax as cfr
-from cfr_jax.baselines import baseline
 from cfr_jax.evaluation import machine
+from cfr_jax.evaluation.baselines import baseline
 from cfr_jax.io import PointCloud
 
 HERE = Path(__file__).parent

@@ -22,16 +22,16 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cfr_jax import network
 from cfr_jax.data.augment import Sampling
-from cfr_jax.data.batches import ShapeSource, batch_at
 from cfr_jax.data.corpus import Corpus
-from cfr_jax.iterations import unroll
-from cfr_jax.layers import apply_layer
-from cfr_jax.losses import pair_loss
-from cfr_jax.neighbors import nearest_on_host
-from cfr_jax.prepared import Cloud, Settings
+from cfr_jax.data.drawing import ShapeSource, batch_at
+from cfr_jax.geometry.neighbors import nearest_on_host
+from cfr_jax.networks.cfr import modules as network
+from cfr_jax.networks.cfr.iterations import unroll
+from cfr_jax.networks.clouds import Cloud, Settings
+from cfr_jax.networks.layers import apply_layer
 from cfr_jax.training import devices, optimizers, step
+from cfr_jax.training.losses import pair_loss
 
 
 def main() -> None:

@@ -14,11 +14,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 import cfr_jax
-from cfr_jax import alignment, io, iterations, metrics, registration
-from cfr_jax.cli.cache import keep_compiled_programs
+from cfr_jax import io
+from cfr_jax.alignment import align as alignment
+from cfr_jax.cli.shared.cache import keep_compiled_programs
+from cfr_jax.evaluation import metrics
+from cfr_jax.networks.cfr import iterations, registration
 
 IMAGES = Path(__file__).parent / "images"
-DEMO = Path(cfr_jax.__file__).parent / "demo"
+DEMO = Path(cfr_jax.__file__).parent / "cli" / "demo_pair"
 SOURCE, TARGET = (1.0, 0.706, 0.0), (0.0, 0.651, 0.929)  # as the viewer colors them
 INK, QUIET, PAPER = "#1b2029", "#5a6472", "#f3f5f8"
 LOUD, CALM = "#ffe9b8", "#d9eefb"

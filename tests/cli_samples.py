@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cfr_jax import io
-from cfr_jax.answers import Alignment
+from cfr_jax.alignment.answers import Alignment
 
 INLIER_DISTANCE = 0.05
 

@@ -27,11 +27,15 @@ def pytest_configure(config):
 def pytest_sessionstart():
     # The fields of a result state the shapes of one pair. Coming out of vmap or a scan it is made
     # anew, with one more axis in front or with placeholders, and that is no mistake.
-    from cfr_jax import confidence, losses, quality, registration, sinkhorn, solving
+    from cfr_jax.alignment import confidence, quality, solving
+    from cfr_jax.networks import sinkhorn
+    from cfr_jax.networks.cfr import registration
+    from cfr_jax.networks.clues import NetworkClues
+    from cfr_jax.training import losses
     from cfr_jax.training.step import TrainState
 
     for kind in (
-        confidence.NetworkClues,
+        NetworkClues,
         registration.Cloud,
         registration.Encoded,
         registration.Registration,
@@ -79,6 +83,6 @@ def state_dict():
 @pytest.fixture(scope="session")
 def params(state_dict):
     """The same weights as ours."""
-    from cfr_jax.convert import from_state_dict
+    from cfr_jax.weights.authors import from_state_dict
 
     return from_state_dict(state_dict)

@@ -7,7 +7,9 @@ import jax
 import numpy as np
 from ml_collections import ConfigDict
 
-from cfr_jax import iterations, network, prepared
+from cfr_jax.networks import clouds as prepared
+from cfr_jax.networks.cfr import iterations
+from cfr_jax.networks.cfr import modules as network
 from cfr_jax.training import devices, step
 from cfr_jax.training.optimizers import make_optimizer, make_schedule
 

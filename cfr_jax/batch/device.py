@@ -12,15 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfr_jax import programs, solving
-from cfr_jax.answers import Alignment, answer
+from cfr_jax.alignment import solving
+from cfr_jax.alignment.answers import Alignment, answer
+from cfr_jax.alignment.planning import SETTINGS, Plan
+from cfr_jax.alignment.second_look import look_again
 from cfr_jax.batch.memo import Memo
-from cfr_jax.iterations import Encoded
-from cfr_jax.planning import SETTINGS, Plan
-from cfr_jax.preparation import UnitCloud
-from cfr_jax.prepared import prepare
-from cfr_jax.registration import encode
-from cfr_jax.second_look import look_again
+from cfr_jax.geometry.units import UnitCloud
+from cfr_jax.networks.cfr.iterations import Encoded
+from cfr_jax.networks.cfr.registration import encode
+from cfr_jax.networks.clouds import prepare
+from cfr_jax.runtime import programs
 
 _KEPT = 32  # encoded targets, about 2 MB each
 

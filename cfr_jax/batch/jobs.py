@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cfr_jax.data.layout import CLOUD_SUFFIXES, Layout, loose_files, scans_of
-from cfr_jax.data.meshes import SUFFIXES as MESH_SUFFIXES
+from cfr_jax.data.making.meshes import SUFFIXES as MESH_SUFFIXES
 from cfr_jax.data.pairs import CsvPairs, Hdf5Pairs
 from cfr_jax.io import PointCloud
 from cfr_jax.io.cloud import usable_normals

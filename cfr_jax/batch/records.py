@@ -1,4 +1,4 @@
-"""What is written of a pair: a JSON record (`cli/batch.schema.json`), and the row of a table."""
+"""What is written of a pair: a JSON record (`cli/schemas`), and the row of a table."""
 
 from __future__ import annotations
 

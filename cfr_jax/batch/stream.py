@@ -11,13 +11,13 @@ from typing import Any
 
 import jax
 
-from cfr_jax import preparation
-from cfr_jax.alignment import checked_params
-from cfr_jax.answers import Alignment
+from cfr_jax.alignment.align import checked_params
+from cfr_jax.alignment.answers import Alignment
+from cfr_jax.alignment.planning import DEFAULT_BUDGET, Plan, planned, whole
 from cfr_jax.batch.device import Device, signature
 from cfr_jax.batch.memo import Memo
+from cfr_jax.geometry import units
 from cfr_jax.io import PointCloud, as_point_cloud
-from cfr_jax.planning import DEFAULT_BUDGET, Plan, planned, whole
 
 # More pairs a call keep an accelerator busy, and a CPU's caches cold.
 ON_CPU, ON_ACCELERATOR = 1, 16
@@ -93,9 +93,9 @@ class _Planner:
             place = os.path.realpath(target)
             target = self._clouds.get(place, lambda: as_point_cloud(target, name="target"))
 
-        def to_unit(cloud: PointCloud, *place: Any, **options: Any) -> preparation.UnitCloud:
-            def make() -> tuple[PointCloud, preparation.UnitCloud]:
-                return cloud, preparation.to_unit(cloud, *place, **options)
+        def to_unit(cloud: PointCloud, *place: Any, **options: Any) -> units.UnitCloud:
+            def make() -> tuple[PointCloud, units.UnitCloud]:
+                return cloud, units.to_unit(cloud, *place, **options)
 
             if cloud is not target:
                 return make()[1]

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cfr_jax.cli import numbers, outputs
+from cfr_jax.cli.shared import numbers, outputs
 
 if TYPE_CHECKING:
     from cfr_jax.batch.jobs import Job
@@ -119,8 +119,8 @@ def run(args: argparse.Namespace) -> int:
 
     from cfr_jax.batch.journal import Journal
     from cfr_jax.batch.sharding import other_shards
-    from cfr_jax.cli.cache import keep_compiled_programs
-    from cfr_jax.weights import DEFAULT, read_weights
+    from cfr_jax.cli.shared.cache import keep_compiled_programs
+    from cfr_jax.weights.files import DEFAULT, read_weights
 
     keep_compiled_programs()
     weights = read_weights(DEFAULT if args.weights is None else args.weights, "cfr")
@@ -155,7 +155,7 @@ def run(args: argparse.Namespace) -> int:
 def _register(left: list[Job], journal: Journal, params: dict, args: argparse.Namespace) -> None:
     from cfr_jax.batch.records import as_record
     from cfr_jax.batch.stream import align_many
-    from cfr_jax.progress import Progress
+    from cfr_jax.runtime.progress import Progress
 
     if not left:
         return
@@ -181,8 +181,8 @@ def _register(left: list[Job], journal: Journal, params: dict, args: argparse.Na
 
 
 def _tell(records: list[dict[str, Any]], out: Path, kept: Path, strict: bool) -> int:
-    from cfr_jax.atomic import write_atomically
     from cfr_jax.batch.records import as_table
+    from cfr_jax.runtime.atomic import write_atomically
 
     write_atomically(out, as_table(records).encode())
     failed = [record for record in records if record["error"] is not None]

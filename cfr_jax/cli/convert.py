@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cfr_jax.cli import outputs
+from cfr_jax.cli.shared import outputs
 
 _DESCRIPTION = """\
 Converts a checkpoint of the CFR authors' PyTorch program into weights for this one:
@@ -49,9 +49,9 @@ def run(args: argparse.Namespace) -> int:
     from hashlib import sha256
 
     from cfr_jax import __version__
-    from cfr_jax.convert import convert
-    from cfr_jax.iterations import iterations_of
-    from cfr_jax.weights import NETWORKS, network_of, read_weights, save_params
+    from cfr_jax.networks.cfr.iterations import iterations_of
+    from cfr_jax.weights.authors import convert
+    from cfr_jax.weights.files import NETWORKS, network_of, read_weights, save_params
 
     params = convert(args.checkpoint)
     notes = {

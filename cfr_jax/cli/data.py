@@ -7,10 +7,10 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cfr_jax.cli import outputs
+from cfr_jax.cli.shared import outputs
 
 if TYPE_CHECKING:
-    from cfr_jax.data.build import Report
+    from cfr_jax.data.making.build import Report
 
 _DESCRIPTION = """\
 Builds the corpora that networks are trained and tested on, and shows what is in one:
@@ -126,7 +126,7 @@ def _build(args: argparse.Namespace) -> int:
         raise ValueError("--unseen: one file has no test split; give --out a folder")
     _check_place(args.out, single)
 
-    from cfr_jax.data.build import build, choose_unseen, folder_items
+    from cfr_jax.data.making.build import build, choose_unseen, folder_items
 
     items = folder_items(args.folder, args.least_faces)
     unseen: tuple[str, ...] | None = None
@@ -147,8 +147,8 @@ def _open_cad(args: argparse.Namespace) -> int:
 
     import json
 
-    from cfr_jax.data.comparison import compare
-    from cfr_jax.data.open_cad import build_open_cad
+    from cfr_jax.data.making.comparison import compare
+    from cfr_jax.data.making.open_cad import build_open_cad
 
     _print_report(build_open_cad(args.out, args.debs), args.out)
     if args.compare is not None:
@@ -180,7 +180,7 @@ def _info(args: argparse.Namespace) -> int:
     for category, count in sorted(counts.items()):
         print(f"{count:6d}  {category}")
     if args.sheet is not None:
-        from cfr_jax.data.sheet import write_sheet
+        from cfr_jax.data.making.sheet import write_sheet
 
         write_sheet(args.sheet, corpus)
         print(f"wrote {args.sheet}")
@@ -203,7 +203,7 @@ def _print_report(report: Report, out: Path) -> None:
     for split, counts in report.counts.items():
         categories = sum(count > 0 for count in counts.values())
         print(f"{split:11s} {sum(counts.values())} shapes of {categories} categories")
-    from cfr_jax.data.build import ENOUGH
+    from cfr_jax.data.making.build import ENOUGH
 
     few = sum(report.counts["val"].values()) if "val" in report.counts else ENOUGH
     if few < ENOUGH:

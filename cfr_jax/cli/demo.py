@@ -6,14 +6,14 @@ import argparse
 import json
 from pathlib import Path
 
-from cfr_jax.cli import outputs
+from cfr_jax.cli.shared import outputs
 
 _DESCRIPTION = """\
 Registers two views of an object, as a depth camera would see it from two places, that ship with
 the package; prints the motion, its quality, and its error against the known truth; and writes
 demo.png (before and after) and demo.html (to turn in a browser) into a folder.
 """
-_PAIR = Path(__file__).parents[1] / "demo"
+_PAIR = Path(__file__).parent / "demo_pair"
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -45,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from cfr_jax import io, viewer
-    from cfr_jax.cli import report
-    from cfr_jax.cli.cache import keep_compiled_programs
+    from cfr_jax.cli.shared import report
+    from cfr_jax.cli.shared.cache import keep_compiled_programs
 
     source, target = io.read(_PAIR / "source.ply"), io.read(_PAIR / "target.ply")
     truth = json.loads((_PAIR / "truth.json").read_text("utf-8"))
@@ -75,7 +75,7 @@ def errors_in_words(estimate, truth, points) -> dict[str, str]:
     """How far (4, 4) `estimate` is from (4, 4) `truth` for (n, 3) `points` of the source."""
     import numpy as np
 
-    from cfr_jax import metrics
+    from cfr_jax.evaluation import metrics
 
     rotation = metrics.err_r(estimate[None], truth[None])[0]
     translation = metrics.err_t(estimate[None], truth[None])[0]

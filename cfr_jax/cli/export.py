@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cfr_jax.cli import outputs
+from cfr_jax.cli.shared import outputs
 
 _DESCRIPTION = """\
 Writes the network, its weights inside, as one program that JAX runs wherever it runs:
@@ -66,8 +66,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Traces the program for each platform, and writes it."""
     outputs.check_output("--out", args.out, (".stablehlo",))
-    from cfr_jax.export import export_register, save_exported
-    from cfr_jax.weights import DEFAULT, read_weights
+    from cfr_jax.weights.files import DEFAULT, read_weights
+    from cfr_jax.weights.stablehlo import export_register, save_exported
 
     weights = read_weights(DEFAULT if args.weights is None else args.weights, "cfr")
     platforms = [name.strip() for name in args.platforms.split(",")]

@@ -27,7 +27,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Prints the cards."""
-    from cfr_jax import cards
+    from cfr_jax.weights import cards
 
     names = cards.names() if args.name is None else (args.name,)
     found = [cards.read_card(name) for name in names]

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from cfr_jax.cli import numbers, outputs
+from cfr_jax.cli.shared import numbers, outputs
 
 UNTRUSTED = 3
 
@@ -157,7 +157,7 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from cfr_jax import io
-    from cfr_jax.cli.transforms import read_transform
+    from cfr_jax.cli.shared.transforms import read_transform
 
     initial: Any = "global" if args.everywhere else None
     if args.initial is not None:
@@ -165,8 +165,8 @@ def run(args: argparse.Namespace) -> int:
         initial = motions[0] if len(motions) == 1 else np.stack(motions)
     source, target = io.read(args.source, seed=args.seed), io.read(args.target, seed=args.seed)
 
-    from cfr_jax.cli import report
-    from cfr_jax.cli.cache import keep_compiled_programs
+    from cfr_jax.cli.shared import report
+    from cfr_jax.cli.shared.cache import keep_compiled_programs
 
     keep_compiled_programs()
     result = report.register(
@@ -217,7 +217,7 @@ def _check_outputs(args: argparse.Namespace, to_stdout: bool) -> None:
 
 
 def _write_json(path: Path | None, document: dict) -> None:
-    from cfr_jax.atomic import write_atomically
+    from cfr_jax.runtime.atomic import write_atomically
 
     text = json.dumps(document, indent=2, allow_nan=False) + "\n"
     if path is None:

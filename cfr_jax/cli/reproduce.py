@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from cfr_jax.cli import models, outputs
+from cfr_jax.cli import models
+from cfr_jax.cli.shared import outputs
 
 FORMAT = "cfr_jax/reproduce/1"
 MISSED = 3
@@ -43,15 +44,16 @@ def run(args: argparse.Namespace) -> int:
     if args.json is not None and not to_stdout:
         outputs.check_output("--json", args.json)
 
-    from cfr_jax import cards
+    from cfr_jax.weights import cards
 
     card = cards.read_card(args.name)
 
-    from cfr_jax import __version__, reproduction
-    from cfr_jax.atomic import write_atomically
-    from cfr_jax.cli.cache import keep_compiled_programs
-    from cfr_jax.progress import Progress
-    from cfr_jax.weights import load_params
+    from cfr_jax import __version__
+    from cfr_jax.cli.shared.cache import keep_compiled_programs
+    from cfr_jax.evaluation import reproduction
+    from cfr_jax.runtime.atomic import write_atomically
+    from cfr_jax.runtime.progress import Progress
+    from cfr_jax.weights.files import load_params
 
     keep_compiled_programs()
     published: dict[str, Any] = card["reproduce"]

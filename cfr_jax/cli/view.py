@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cfr_jax.cli import outputs
+from cfr_jax.cli.shared import outputs
 
 _DESCRIPTION = """\
 Draws a result that `cfr register --json` wrote, without registering again:
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     given = [path for path in (args.result, args.source, args.target) if path is not None]
     outputs.check_apart(given, wanted)
 
-    from cfr_jax.cli import saved
+    from cfr_jax.cli.shared import saved
 
     document = saved.read_result(args.result)
     paths = {

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Int
 from scipy.spatial.transform import Rotation
 
 from cfr_jax.data.protocol import NOISE_CLIP, NOISE_SCALE, random_motion, resample, way_back
-from cfr_jax.neighbors import nearest_on_host
+from cfr_jax.geometry.neighbors import nearest_on_host
 
 _SHARES = (
     "both_ways",

@@ -22,11 +22,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from cfr_jax.atomic import unfinished
 from cfr_jax.data.pairs import Pair
 from cfr_jax.data.protocol import random_motion, resample
 from cfr_jax.data.scans import estimate_normals, refine_point_to_plane, voxel_mean
-from cfr_jax.progress import Progress
+from cfr_jax.runtime.atomic import unfinished
+from cfr_jax.runtime.progress import Progress
 
 VOXEL = 0.3  # m
 NORMAL_RADIUS = 3.0  # m

@@ -22,7 +22,7 @@ from typing import Literal, get_args
 
 import h5py
 
-from cfr_jax.data.meshes import SUFFIXES as MESH_SUFFIXES
+from cfr_jax.data.making.meshes import SUFFIXES as MESH_SUFFIXES
 
 Kind = Literal["pair-list", "pair-file", "corpus", "modelnet40", "kitti", "clouds", "meshes"]
 KINDS = get_args(Kind)

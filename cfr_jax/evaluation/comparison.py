@@ -11,16 +11,16 @@ import numpy as np
 from jaxtyping import Bool
 from tqdm import tqdm
 
-from cfr_jax.atomic import write_atomically
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation import machine
 from cfr_jax.evaluation.datasets import read_pairs
+from cfr_jax.evaluation.drawing.tables import Numbers, write_table
 from cfr_jax.evaluation.measuring import Measured, measure, only, summarize
 from cfr_jax.evaluation.methods import methods_of
 from cfr_jax.evaluation.records import Records
 from cfr_jax.evaluation.running import run_method
 from cfr_jax.evaluation.symmetry import nearly_symmetric
-from cfr_jax.evaluation.tables import Numbers, write_table
+from cfr_jax.runtime.atomic import write_atomically
 
 
 def compare(
@@ -35,8 +35,8 @@ def compare(
     """
     methods = methods_of(config, names, config.seed)
     if plots:
-        from cfr_jax.evaluation.figures import draw_all, new_figure
-        from cfr_jax.evaluation.gallery import draw_gallery
+        from cfr_jax.evaluation.drawing.figures import draw_all, new_figure
+        from cfr_jax.evaluation.drawing.gallery import draw_gallery
 
         new_figure(1, 1)  # better missed now than after all methods have run
     pairs = read_pairs(config.data, config.limit, out / "cache")

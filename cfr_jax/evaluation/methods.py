@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from cfr_jax.baselines import NAMES, baseline
 from cfr_jax.data.pairs import Pair
+from cfr_jax.evaluation.baselines import NAMES, baseline
 from cfr_jax.evaluation.records import code_digest
 from cfr_jax.io import PointCloud
 from cfr_jax.io.cloud import usable_normals
@@ -24,13 +24,16 @@ _FIELDS = {"use", "options", "weights", "threads", "batch", "estimated_normals",
 # Whose seed changes the answer.
 _DRAWING = {"fgr", "fgr_icp", "ransac"}
 # Files that decide the answers of the peers, and of those methods that are made of our own code.
-_PEERS = ("baselines/*.py", "data/scans.py")
+_PEERS = ("evaluation/baselines/*.py", "data/scans.py")
 _OURS = (
     *_PEERS,
-    "*.py",
-    "extraction/*.py",
+    "alignment/*.py",
+    "geometry/*.py",
     "io/cloud.py",
-    "sinkhorn/*.py",
+    "networks/**/*.py",
+    "refine/*.py",
+    "runtime/*.py",
+    "weights/files.py",
     "evaluation/modules.py",
     "evaluation/network.py",
 )
@@ -103,7 +106,7 @@ def _method(name: str, config: Any, seed: int) -> Method:
     make: Callable[[], Solver]
     modules = None
     if use in NETWORKS:
-        from cfr_jax.weights import NoWeights, read_weights
+        from cfr_jax.weights.files import NoWeights, read_weights
 
         own = entry.get("weights") or (None if use == OWN else config.rpmnet_weights)
         source = own or config.weights

@@ -15,16 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfr_jax import rigid, rpmnet
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.methods import clouds_of
-from cfr_jax.features import raw_features
-from cfr_jax.iterations import bind, iterations_of
-from cfr_jax.neighbors import nearest_on_host
-from cfr_jax.normals import estimate_normals
-from cfr_jax.prepared import Cloud, Settings
-from cfr_jax.sinkhorn import Affinity, match
-from cfr_jax.weights import load_params
+from cfr_jax.geometry import rigid
+from cfr_jax.geometry.neighbors import nearest_on_host
+from cfr_jax.geometry.normals import estimate_normals
+from cfr_jax.networks import rpmnet
+from cfr_jax.networks.cfr.iterations import bind, iterations_of
+from cfr_jax.networks.clouds import Cloud, Settings
+from cfr_jax.networks.features import raw_features
+from cfr_jax.networks.sinkhorn import Affinity, match
+from cfr_jax.weights.files import load_params
 
 NEIGHBORS, FEATURES, ANNEALING = "neighbors", "features", "annealing"
 MATCHING, MOTION = "matching and Sinkhorn", "Procrustes"

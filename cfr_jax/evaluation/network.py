@@ -14,16 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfr_jax import programs, refinement, rigid, rpmnet, solving
-from cfr_jax.alignment import align
+from cfr_jax.alignment import solving
+from cfr_jax.alignment.align import align
+from cfr_jax.alignment.planning import planned
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.methods import Answer, Solver, clouds_of
-from cfr_jax.iterations import Step, unroll
-from cfr_jax.neighbors import nearest_on_host
-from cfr_jax.normals import estimate_normals
-from cfr_jax.planning import planned
-from cfr_jax.prepared import Cloud, Settings, moved_by
-from cfr_jax.weights import load_params
+from cfr_jax.geometry import rigid
+from cfr_jax.geometry.neighbors import nearest_on_host
+from cfr_jax.geometry.normals import estimate_normals
+from cfr_jax.networks import rpmnet
+from cfr_jax.networks.cfr.iterations import Step, unroll
+from cfr_jax.networks.clouds import Cloud, Settings, moved_by
+from cfr_jax.refine import generalized_icp
+from cfr_jax.runtime import programs
+from cfr_jax.weights.files import load_params
 
 Unroll = Callable[[dict, Cloud, Cloud, Any], Iterator[Step]]
 KINDS: dict[str, tuple[Unroll, Any]] = {
@@ -203,7 +207,7 @@ def _solve(
         if not program.refine:
             return transforms
         surfaces = solving.surface(source), solving.surface(target)
-        refined = refinement.refine(*surfaces, transforms[-1]).transform
+        refined = generalized_icp.refine(*surfaces, transforms[-1]).transform
         return jnp.concatenate([transforms, refined[None]])
 
     size = program.vectorized if program.vectorized > 1 else None

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from cfr_jax.atomic import write_atomically
 from cfr_jax.data.pairs import Pair
+from cfr_jax.runtime.atomic import write_atomically
 
 _PACKAGE = Path(__file__).parents[1]
 

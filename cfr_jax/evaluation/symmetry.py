@@ -25,9 +25,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from cfr_jax.atomic import write_atomically
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.records import code_digest
+from cfr_jax.runtime.atomic import write_atomically
 
 LIMIT = 2.0
 _TURNS = (180.0, 120.0, 72.0)  # degrees

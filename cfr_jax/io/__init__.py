@@ -1,7 +1,7 @@
 """Reading and writing of point clouds, and what users call a point cloud made into one."""
 
-from .cloud import CloudFileError, PointCloud
-from .convert import as_point_cloud
-from .files import read, write
+from cfr_jax.io.cloud import CloudFileError, PointCloud
+from cfr_jax.io.coercion import as_point_cloud
+from cfr_jax.io.files import read, write
 
 __all__ = ["CloudFileError", "PointCloud", "as_point_cloud", "read", "write"]

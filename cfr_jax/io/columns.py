@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .cloud import PointCloud, usable_normals
+from cfr_jax.io.cloud import PointCloud, usable_normals
 
 # sensor_msgs/PointField: the numbers of the types.
 _ROS_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}

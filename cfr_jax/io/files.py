@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from . import arrays, gltf, las, pcd, ply, surfaces, text
-from .cloud import CloudFileError, PointCloud
-from .mesh import Mesh
+from cfr_jax.io.cloud import CloudFileError, PointCloud
+from cfr_jax.io.formats import arrays, gltf, las, pcd, ply, surfaces, text
+from cfr_jax.io.mesh import Mesh
 
 _READERS: dict[str, Callable[..., PointCloud | Mesh]] = {
     ".ply": ply.parse,

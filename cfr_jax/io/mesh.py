@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int64, Real
 
-from .cloud import PointCloud, checked_points, usable_normals
+from cfr_jax.io.cloud import PointCloud, checked_points, usable_normals
 
 DEFAULT_SAMPLES = 10_000
 

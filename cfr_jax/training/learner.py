@@ -8,10 +8,12 @@ from typing import Any
 
 import jax
 
-from cfr_jax import iterations, network, prepared, rpmnet
+from cfr_jax.networks import clouds, rpmnet
+from cfr_jax.networks.cfr import iterations
+from cfr_jax.networks.cfr import modules as network
 from cfr_jax.training.step import Unroll
 
-AnySettings = prepared.Settings | rpmnet.Settings
+AnySettings = clouds.Settings | rpmnet.Settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,8 +59,8 @@ def learner(config: Any) -> Learner:
                 key, config.iterations, config.get("shared", False)
             ),
             unroll=iterations.unroll,
-            trained=lambda count: prepared.Settings(neighbors=count, detach_motion=True, **changed),
-            validated=prepared.Settings(**changed),
+            trained=lambda count: clouds.Settings(neighbors=count, detach_motion=True, **changed),
+            validated=clouds.Settings(**changed),
         )
     if config.network == "rpmnet":
         if changed := dict(config.get("settings", {})):
@@ -73,7 +75,7 @@ def learner(config: Any) -> Learner:
 
 
 def _check_settings(changed: dict[str, Any]) -> None:
-    allowed = {field.name for field in dataclasses.fields(prepared.Settings)}
+    allowed = {field.name for field in dataclasses.fields(clouds.Settings)}
     allowed -= {"neighbors", "detach_motion"}  # those of the phases, and of all training
     if unknown := changed.keys() - allowed:
         raise ValueError(

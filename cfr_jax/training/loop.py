@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from cfr_jax import weights
-from cfr_jax.data.batches import batches
-from cfr_jax.training import devices, record, step, stopping, validation
+from cfr_jax.data.drawing import batches
+from cfr_jax.training import devices, step, stopping, validation
 from cfr_jax.training.checkpoints import Checkpoints
 from cfr_jax.training.learner import Phase, remaining
-from cfr_jax.training.reports import Reports
+from cfr_jax.training.reporting import record
+from cfr_jax.training.reporting.reports import Reports
 from cfr_jax.training.step import TrainState
 from cfr_jax.training.task import Task, fresh_params, prepare
+from cfr_jax.weights import files as weights
 
 
 def run(config: Any, workdir: Path) -> dict:

@@ -15,12 +15,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from cfr_jax import io, preparation
+from cfr_jax import io
 from cfr_jax.data import kitti
 from cfr_jax.data.augment import Sampling, View, choose_rows, finish_pair
 from cfr_jax.data.layout import CLOUD_SUFFIXES, loose_files, scans_of
 from cfr_jax.data.pairs import CsvPairs, Hdf5Pairs, Pair, among, open_pairs
 from cfr_jax.data.protocol import crop
+from cfr_jax.geometry import units
 
 _HELD = 128  # pairs in memory: reading one takes longer than drawing from it
 _MOST = 1 << 16  # points of a cloud in memory, drawn at random: scans of any size then fit
@@ -63,7 +64,7 @@ class SceneSource:
         ):
             kept = crop(points, rng.uniform(*sampling.keep), rng)
             clouds.append(io.PointCloud(points[kept], None if normals is None else normals[kept]))
-        frames = preparation.unit_frames(*clouds, None)
+        frames = units.unit_frames(*clouds, None)
         centers = frames.source_center, frames.target_center
         views = [
             _view(cloud, center, frames.scale, sampling, uneven, rng)
@@ -213,7 +214,7 @@ def _view(
     points = (cloud.points - center) / scale
     rows = np.arange(len(points))
     if not uneven:
-        rows = preparation.subsample(points, sampling.points, int(rng.integers(2**32)))
+        rows = units.subsample(points, sampling.points, int(rng.integers(2**32)))
     rows = rows[choose_rows(points[rows], sampling, uneven, rng)]
     normals = None if cloud.normals is None else cloud.normals[rows].astype(np.float32)
     return View(points[rows].astype(np.float32), normals)

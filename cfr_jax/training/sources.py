@@ -18,13 +18,13 @@ from typing import Any
 import ml_collections
 import numpy as np
 
-from cfr_jax.atomic import write_atomically
 from cfr_jax.data import protocol
 from cfr_jax.data.augment import Sampling
-from cfr_jax.data.batches import Mixture, ShapeSource, Source
 from cfr_jax.data.corpus import read_corpus
-from cfr_jax.neighbors import nearest_on_host
-from cfr_jax.progress import Progress
+from cfr_jax.data.drawing import Mixture, ShapeSource, Source
+from cfr_jax.geometry.neighbors import nearest_on_host
+from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.runtime.progress import Progress
 from cfr_jax.training import scenes
 from cfr_jax.training.devices import is_first
 

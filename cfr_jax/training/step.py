@@ -14,11 +14,11 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Int
 
-from cfr_jax.iterations import Step
-from cfr_jax.losses import PairLoss, pair_loss
-from cfr_jax.normals import estimate_normals
-from cfr_jax.prepared import Cloud
+from cfr_jax.geometry.normals import estimate_normals
+from cfr_jax.networks.cfr.iterations import Step
+from cfr_jax.networks.clouds import Cloud
 from cfr_jax.training.devices import AXIS
+from cfr_jax.training.losses import PairLoss, pair_loss
 
 Unroll = Callable[[dict, Cloud, Cloud, Hashable], Iterator[Step]]
 """The iterations of a network on a pair: `iterations.unroll`, or `rpmnet.unroll`."""

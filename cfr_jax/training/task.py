@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
-from cfr_jax import weights
 from cfr_jax.data.augment import Sampling
-from cfr_jax.data.batches import Mixture
-from cfr_jax.data.build import ENOUGH
+from cfr_jax.data.drawing import Mixture
+from cfr_jax.data.making.build import ENOUGH
 from cfr_jax.training import devices, optimizers, sources, step
 from cfr_jax.training.learner import Learner, Phase, learner
+from cfr_jax.weights import files as weights
 
 _FIELDS = (
     "seed", "network", "iterations", "data.train", "data.validation", "phases", "sampling",

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from cfr_jax import metrics
+from cfr_jax.evaluation import metrics
 from cfr_jax.training import devices, step, stopping
 from cfr_jax.training.learner import Learner
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int, UInt8
 
-from cfr_jax.atomic import write_atomically
+from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.viewer.scene import Scene
 from cfr_jax.viewer.view import View, best_view
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64
 
-from cfr_jax.atomic import write_atomically
+from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.viewer.scene import Scene
 from cfr_jax.viewer.view import best_view
 

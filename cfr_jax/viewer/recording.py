@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 
-from cfr_jax.atomic import unfinished
+from cfr_jax.runtime.atomic import unfinished
 from cfr_jax.viewer.picture import SOURCE, TARGET
 from cfr_jax.viewer.scene import Scene
 from cfr_jax.viewer.view import best_view

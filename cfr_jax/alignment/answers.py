@@ -1,0 +1,143 @@
+"""What `align` answers: the motion in the caller's frame and units, and how far to trust it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from cfr_jax.alignment import confidence, doubts, quality, solving
+from cfr_jax.alignment.planning import Plan
+from cfr_jax.alignment.search import Search
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Answer of `align`; everything in the caller's frame and units."""
+
+    transform: Float[np.ndarray, "4 4"]
+    """Maps source onto target: `transform @ [x; 1]` lies on the target. Float64."""
+    transforms: Float[np.ndarray, "L 4 4"]
+    """What the network answered, one per iteration of its two cascades, before any refinement."""
+    refined: bool
+    """Whether `transform` is not the network's last, but an answer that fits no worse: the
+    refinement's, or the start where that fits better still."""
+    confidence: float
+    """Estimated probability, in [0, 1], that the motion is right to 5 degrees and 0.1 radii."""
+    clues: dict[str, float]
+    """What the confidence was estimated from (`confidence.Clues`)."""
+    determined: bool
+    """Whether the clouds determine the motion; false where one slides or turns on the other."""
+    fitness: float
+    """Share of the source that has a target point within `inlier_distance`."""
+    inlier_rmse: float
+    """Root mean square distance of those points."""
+    inlier_distance: float
+    weights: Float[np.ndarray, " n"]
+    """How much of each used source point found a partner, in [0, 1]."""
+    source_rows: Int[np.ndarray, " n"]
+    """Which source points the network saw."""
+    target_rows: Int[np.ndarray, " m"]
+    neighbors: int
+    """Neighbors per point; small clouds have fewer than the usual 64."""
+    warnings: tuple[str, ...]
+    """Why the answer should not be trusted, or what was done differently, in words."""
+    seconds: dict[str, float]
+    """`compile` (zero when a program of this size was there already), `run`, and `total`."""
+    converged: bool = False
+    """Whether the refinement ended because nothing moved any more; false without one."""
+    steps: int = 0
+    """How many steps the refinement took."""
+    overlap: float = 0.0
+    """Estimated share of the source that the target saw, too."""
+    information: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
+    """Information matrix of the inliers among the used points, as Open3D's
+    `get_information_matrix_from_point_clouds` gives it: rotation first, about the origin of the
+    target's frame."""
+    initial: Float[np.ndarray, "4 4"] | None = None
+    """Where the network started, in the caller's frame: as given, or as a search found it."""
+    starts: int = 1
+    """How many starts were tried, or looked at a second time."""
+    alternatives: Float[np.ndarray, "a 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    """Other motions that a search found to fit about as well: the shape is nearly symmetric."""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the motion is determined and more likely right than wrong."""
+        return self.determined and self.confidence >= doubts.TRUSTED
+
+    def to_open3d(self) -> Any:
+        """The answer as an `open3d.pipelines.registration.RegistrationResult`.
+
+        `transformation`, `fitness` and `inlier_rmse` mean in Open3D what they mean here:
+        `source.transform(result.to_open3d().transformation)` lays the source on the target. The
+        correspondences are soft here, so that `correspondence_set` stays empty. Raises
+        ModuleNotFoundError without Open3D.
+        """
+        try:
+            from open3d.pipelines.registration import RegistrationResult
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(
+                'to_open3d needs Open3D: pip install "cfr_jax[baselines]"', name="open3d"
+            ) from error
+        result = RegistrationResult()
+        result.transformation = self.transform
+        result.fitness, result.inlier_rmse = self.fitness, self.inlier_rmse
+        return result
+
+
+def answer(
+    plan: Plan, found: solving.Found, seconds: dict[str, float], searched: Search | None = None
+) -> Alignment:
+    """What the device found of a plan, in the caller's frame and units, and how far to trust it.
+
+    `searched` is the search that the plan's start came from, if there was one.
+    """
+    frames = plan.frames
+    transform = frames.to_caller(np.asarray(found.transform))
+    initial = None if np.array_equal(frames.initial, np.eye(4)) else frames.initial
+    far = None if searched is None or searched.nearby else searched
+    rivals = np.zeros((0, 4, 4)) if far is None else far.rivals(transform)
+    resistance = np.asarray(found.quality.resistance)
+    determined = bool(resistance.min() >= doubts.FREE)
+    weakest = np.asarray(found.quality.weakest)[resistance.argmin()]
+    fitness = float(found.quality.fitness)
+    clues = confidence.named(found.clues)
+    probability = doubts.probability(clues, fitness)
+    neighbors = min(plan.source.neighbors.shape[1], plan.target.neighbors.shape[1])
+    return Alignment(
+        transform=transform,
+        transforms=frames.to_caller(np.asarray(found.registration.transforms)),
+        refined=bool(found.improved),
+        converged=bool(found.converged),
+        steps=int(found.steps),
+        confidence=probability,
+        clues=clues,
+        determined=determined,
+        fitness=fitness,
+        inlier_rmse=float(found.quality.inlier_rmse) * frames.scale,
+        inlier_distance=solving.DISTANCE * frames.scale,
+        weights=np.asarray(found.registration.weights, np.float64)[: len(plan.source.rows)],
+        source_rows=plan.source.rows,
+        target_rows=plan.target.rows,
+        neighbors=neighbors,
+        warnings=doubts.warnings_of(
+            None if determined else weakest,
+            doubts.turns(transform, rivals),
+            probability,
+            fitness,
+            neighbors,
+            frames.size_ratio,
+            far is not None,
+        ),
+        seconds=seconds,
+        initial=initial,
+        starts=1 if searched is None else searched.starts,
+        alternatives=rivals,
+        overlap=float(found.quality.overlap),
+        information=quality.information_matrix(
+            np.asarray(found.quality.moments), frames.target_center, frames.scale
+        ),
+    )

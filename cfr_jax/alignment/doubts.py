@@ -1,0 +1,98 @@
+"""Why an answer should not be trusted, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from cfr_jax.alignment import confidence
+from cfr_jax.alignment.planning import SETTINGS
+
+# Below this the fit hardly suffers when a cloud slides or turns. Of planes, spheres, cylinders,
+# cones and the like, sampled twice by 200 to 500 points with noise, 97% measured less along their
+# free directions; of partial views of real objects about three quarters measured more.
+FREE = 0.08
+TRUSTED = 0.5
+_HARDLY = 0.2  # of the source on the target: too little to say what the shapes determine
+_SIZES_APART = 5.0  # more than partial views of one thing differ in radius
+
+
+def warnings_of(
+    free: Float[np.ndarray, " 6"] | None,
+    rivals: Sequence[str],
+    probability: float,
+    fitness: float,
+    neighbors: int,
+    size_ratio: float,
+    searched: bool,
+) -> tuple[str, ...]:
+    """`free` is the twist that nothing determines, if there is one; `rivals` are the turns by which
+    other answers differ (`turns`); `size_ratio` is the radius of the source over the target's;
+    `searched` tells whether more than one start was tried."""
+    warnings = []
+    if not 1 / _SIZES_APART < size_ratio < _SIZES_APART:
+        larger, smaller, times = "source", "target", size_ratio
+        if size_ratio < 1:
+            larger, smaller, times = "target", "source", 1 / size_ratio
+        warnings.append(f"the {larger} is {times:.3g} times as large as the {smaller}: same units?")
+    if fitness < _HARDLY:
+        warnings.append(f"the clouds hardly meet: {fitness:.0%} of the source lies on the target")
+    elif free is not None:
+        warnings.append(f"the clouds do not determine the motion: they {_describe(free)} freely")
+    if rivals:
+        warnings.append(f"nearly symmetric: fits about as well {' or '.join(rivals)}")
+    if probability < TRUSTED:
+        hint = "" if searched else '; clouds turned far need initial="global" (--global)'
+        warnings.append(
+            f"not to be trusted: confidence {probability:.2f}, "
+            f"{fitness:.0%} of the source lies on the target{hint}"
+        )
+    if neighbors < SETTINGS.neighbors:
+        warnings.append(
+            f"small clouds: {neighbors} neighbors per point instead of {SETTINGS.neighbors}"
+        )
+    return tuple(warnings)
+
+
+def probability(clues: Mapping[str, float], fitness: float) -> float:
+    """That the answer is right: no greater than the fitness where the clouds hardly meet. Those it
+    was fitted to did, and it says nothing of others."""
+    fitted = confidence.of_alignment(clues)
+    return min(fitted, fitness) if fitness < _HARDLY else fitted
+
+
+def turns(
+    transform: Float[np.ndarray, "4 4"], others: Float[np.ndarray, "a 4 4"]
+) -> tuple[str, ...]:
+    """By which turns `others` differ from `transform`, about axes of the target's frame."""
+    if not len(others):
+        return ()
+    # imported here: half a second that most answers need not wait for
+    from scipy.spatial.transform import Rotation
+
+    told = []
+    for other in others:
+        turn = Rotation.from_matrix(other[:3, :3] @ transform[:3, :3].T).as_rotvec(degrees=True)
+        angle = float(np.linalg.norm(turn))
+        told.append(f"turned by {angle:.0f}° about {direction(turn)}" if angle > 1 else "shifted")
+    return tuple(told)
+
+
+def _describe(twist):
+    turn, slide = twist[:3], twist[3:]
+    verb, axis = (
+        ("turn about", turn)
+        if np.linalg.norm(turn) >= np.linalg.norm(slide)
+        else ("slide along", slide)
+    )
+    return f"{verb} {direction(axis)}"
+
+
+def direction(axis: Float[np.ndarray, " 3"]) -> str:
+    """A line through the origin, written as the unit vector whose largest part is positive."""
+    axis = axis / np.linalg.norm(axis)
+    axis = axis * np.sign(axis[np.abs(axis).argmax()])
+    axis = axis.round(2) + 0.0  # no "-0.00"
+    return f"({', '.join(f'{value:.2f}' for value in axis)})"

@@ -1,0 +1,133 @@
+"""A pair made ready on the host: read, checked, centered, scaled and thinned."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cfr_jax.geometry import units
+from cfr_jax.io import PointCloud, as_point_cloud
+from cfr_jax.networks.clouds import Settings
+
+DEFAULT_BUDGET = 1024
+SETTINGS = Settings()
+CASCADES = 2  # chosen on validation pairs (docs/training.md)
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What `align` does before the device is asked."""
+
+    frames: units.Frames
+    source: units.UnitCloud
+    target: units.UnitCloud
+    seed: int = 0
+    start_given: bool = False
+    """Whether somebody said where the source starts; else centroid lies on centroid."""
+
+    def started_at(self, motion: Float[np.ndarray, "4 4"]) -> Plan:
+        """The same clouds, the source moved by `motion` of unit clouds first."""
+        rotation, shift = motion[:3, :3], motion[:3, 3]
+        points = np.float32(self.source.points @ rotation.T + shift) * self.source.mask[:, None]
+        normals = self.source.normals
+        moved = dataclasses.replace(
+            self.source,
+            points=points,
+            normals=None if normals is None else np.float32(normals @ rotation.T),
+        )
+        frames = dataclasses.replace(
+            self.frames,
+            source_center=self.frames.target_center,
+            initial=self.frames.to_caller(motion),
+        )
+        return Plan(frames, moved, self.target, self.seed, start_given=True)
+
+
+def read_clouds(source: Any, target: Any) -> tuple[PointCloud, PointCloud]:
+    """Both as clouds; raises ValueError, by name, for what is none or has too few points."""
+    clouds = as_point_cloud(source, name="source"), as_point_cloud(target, name="target")
+    for cloud, name in zip(clouds, ("source", "target"), strict=True):
+        if len(cloud.points) < 3:
+            raise ValueError(f"{name}: got {len(cloud.points)} points, wanted at least 3")
+    return clouds
+
+
+def planned(
+    source: Any,
+    target: Any,
+    *,
+    initial: Float[np.ndarray, "4 4"] | None = None,
+    max_points: int | None = None,
+    seed: int = 0,
+    settings: Settings = SETTINGS,
+    to_unit: Callable[..., units.UnitCloud] = units.to_unit,
+) -> Plan:
+    """Reads, centers, scales and thins a pair; arguments and errors are those of `align`.
+
+    `to_unit` may stand in for `units.to_unit`, and remember what it made.
+    """
+    source, target = read_clouds(source, target)
+    if initial is not None:
+        motions = rigid_motions(initial)
+        if len(motions) > 1:
+            raise ValueError(f"initial: got {len(motions)} motions, wanted one")
+        initial = motions[0]
+    budget = DEFAULT_BUDGET if max_points is None else whole("max_points", max_points, least=3)
+    seed = whole("seed", seed, least=0)
+    frames = units.unit_frames(source, target, initial)
+    made = (
+        to_unit(
+            cloud,
+            center,
+            frames.scale,
+            motion,
+            budget=budget,
+            neighbors=settings.neighbors,
+            radius=settings.radius,
+            seed=seed,
+        )
+        for cloud, center, motion in (
+            (source, frames.source_center, frames.initial),
+            (target, frames.target_center, np.eye(4)),
+        )
+    )
+    return Plan(frames, *made, seed, start_given=initial is not None)
+
+
+def whole(name: str, value: Any, *, least: int) -> int:
+    """`value` if it is a whole number of at least `least`; else a ValueError with the name."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name}: got {value!r}, wanted a whole number of at least {least}")
+    return int(value)
+
+
+def rigid_motions(initial: Any) -> Float[np.ndarray, "k 4 4"]:
+    """One or several initial motions, float64; raises ValueError for anything else."""
+    try:
+        motions = np.asarray(initial, np.float64)
+    except (TypeError, ValueError):
+        what = repr(initial) if isinstance(initial, str) else f"a {type(initial).__name__}"
+        raise ValueError(
+            f"initial: got {what} that is no array of numbers, "
+            'wanted "global", a (4, 4) matrix, or several as (k, 4, 4)'
+        ) from None
+    if motions.ndim not in (2, 3) or motions.shape[-2:] != (4, 4) or not motions.size:
+        raise ValueError(f"initial: got shape {motions.shape}, wanted (4, 4) or (k, 4, 4)")
+    if not np.isfinite(motions).all():
+        raise ValueError("initial: got numbers that are not finite, wanted a rigid motion")
+    motions = motions.reshape(-1, 4, 4)
+    rotations = motions[:, :3, :3]
+    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
+    last = np.abs(motions[:, 3] - [0, 0, 0, 1]).max()
+    if off > 1e-3 or (np.linalg.det(rotations) < 0).any() or last > 1e-6:
+        raise ValueError(
+            "initial: got a matrix that is no rigid motion, wanted a proper rotation "
+            "and a last row 0 0 0 1"
+        )
+    return motions

@@ -1,0 +1,214 @@
+"""Refinement on all points of large clouds, from the answer of thinned ones.
+
+The usual pyramid of voxel grids: the network and the first refinement see a thousand points, then
+come a grid eight times as full and the clouds themselves, each with a narrower cut. The steps are
+those of `refinement`; the closest points come from a KD-tree on the host, and the sums are taken
+over some thousand pairs at a time, so memory grows with the clouds and nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cfr_jax.alignment.planning import Plan
+from cfr_jax.alignment.solving import DISTANCE, Found
+from cfr_jax.geometry import rigid
+from cfr_jax.geometry.neighbors import nearest_on_host
+from cfr_jax.geometry.normals import estimate_normals
+from cfr_jax.geometry.units import bucket, subsample
+from cfr_jax.io import PointCloud
+from cfr_jax.refine import generalized_icp
+from cfr_jax.refine.generalized_icp import Stage, Surface
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+_FULLER = 8  # points of the middle level, as a multiple of the network's
+_NEIGHBORS = 24  # a normal's neighborhood; shrinks with the spacing
+_THICKNESS = generalized_icp.STAGES[-1].thickness
+# The cut of a level: this many times the median distance of the pairs that it starts with, which
+# is about half the spacing where the clouds lie on each other, and noise where they are noisy.
+_SPREADS = 4.0
+_LEAST_CUT = 1e-4  # of the same points twice
+_MOST_STEPS = 20
+_SETTLED = 1e-6  # radians and units of the unit sphere
+_ROWS = 1 << 13
+
+
+class Level(NamedTuple):
+    """Both clouds on one grid, in the unit sphere."""
+
+    source: Float[np.ndarray, "n 3"]
+    source_normals: Float[np.ndarray, "n 3"]
+    target: Float[np.ndarray, "m 3"]
+    target_normals: Float[np.ndarray, "m 3"]
+    tree: cKDTree
+    """Of the target."""
+
+
+class Fine(NamedTuple):
+    """Answer of `refine`."""
+
+    transform: Float[np.ndarray, "4 4"]
+    """Maps source onto target; the initial one where refining made the score worse."""
+    improved: bool
+    converged: bool
+    steps: int
+    fitness: float
+    """Share of the source within `solving.DISTANCE` of the target."""
+    inlier_rmse: float
+
+
+def on_all_points(plan: Plan, source: PointCloud, target: PointCloud, found: Found) -> Found:
+    """`found`, its transform refined on all points, fitness and inlier error measured on them.
+
+    The clouds are the caller's, which `plan` thinned.
+    """
+    frames = plan.frames
+    fine = refine(
+        _unit(source, frames.source_center, frames.scale, frames.initial),
+        _unit(target, frames.target_center, frames.scale, np.eye(4)),
+        np.asarray(found.transform, np.float64),
+        thinned_to=max(len(plan.source.rows), len(plan.target.rows)),
+    )
+    quality = dataclasses.replace(
+        found.quality,
+        fitness=jnp.asarray(fine.fitness, jnp.float32),
+        inlier_rmse=jnp.asarray(fine.inlier_rmse, jnp.float32),
+    )
+    return dataclasses.replace(
+        found,
+        transform=jnp.asarray(fine.transform, jnp.float32),
+        improved=found.improved | fine.improved,
+        converged=jnp.asarray(fine.converged),
+        steps=found.steps + fine.steps,
+        quality=quality,
+    )
+
+
+def refine(
+    source: PointCloud,
+    target: PointCloud,
+    initial: Float[np.ndarray, "4 4"],
+    *,
+    thinned_to: int,
+) -> Fine:
+    """Refines `initial`, which maps source onto target within the unit sphere, and came of
+    `thinned_to` points. The result is kept only where it scores no worse on all points."""
+    most = max(len(source.points), len(target.points))
+    fuller = _FULLER * thinned_to
+    transform, cut, steps, settled = initial, DISTANCE, 0, False
+    for budget in (fuller, most) if fuller < most / 2 else (most,):
+        level = _level(source, target, budget)
+        cut = _cut(level, transform, cut)
+        transform, taken, settled = _descend(level, transform, cut)
+        steps += taken
+    before, after = (_score(level, motion, cut) for motion in (initial, transform))
+    improved = after <= before
+    transform = transform if improved else initial
+    return Fine(transform, improved, settled, steps, *_fit(level, transform))
+
+
+def _unit(cloud, center, scale, motion):
+    points = (cloud.points @ motion[:3, :3].T + motion[:3, 3] - center) / scale
+    normals = None if cloud.normals is None else cloud.normals @ motion[:3, :3].T
+    return PointCloud(points, normals)
+
+
+def _level(source, target, budget):
+    # imported here: a fifth of a second that `align` alone need not wait for
+    from scipy.spatial import cKDTree
+
+    parts = []
+    for cloud in (source, target):
+        rows = subsample(cloud.points, budget, seed=0)
+        points, normals = cloud.points[rows].astype(np.float32), cloud.normals
+        parts += [points, _normals(points) if normals is None else np.float32(normals[rows])]
+    return Level(*parts, cKDTree(parts[2]))
+
+
+_estimate = jax.jit(estimate_normals)
+
+
+def _normals(points):
+    k = min(_NEIGHBORS, len(points) - 1)
+    pad = ((0, bucket(len(points)) - len(points)), (0, 0))
+    near = np.pad(nearest_on_host(points, k, workers=-1), pad)
+    return np.asarray(_estimate(np.pad(points, pad), near))[: len(points)]
+
+
+def _pairs(level, transform, cut):
+    """The closest target point of each source point, and its distance; infinite beyond the cut."""
+    moved = level.source @ transform[:3, :3].T + transform[:3, 3]
+    return level.tree.query(moved, distance_upper_bound=cut, workers=-1)
+
+
+def _cut(level, transform, cut):
+    distance, _ = _pairs(level, transform, cut)
+    near = distance[np.isfinite(distance)]
+    return min(cut, max(_LEAST_CUT, _SPREADS * float(np.median(near)))) if len(near) else cut
+
+
+def _descend(level, transform, cut):
+    stage = Stage(*np.float32([cut, _THICKNESS]))
+    for step in range(_MOST_STEPS):
+        _, index = _pairs(level, transform, stage.cut)
+        twist = _twist(level, np.minimum(index, len(level.target) - 1), transform, stage)
+        transform = twist @ transform
+        if np.abs(twist - np.eye(4)).max() <= _SETTLED:
+            return transform, step + 1, True
+    return transform, _MOST_STEPS, False
+
+
+def _twist(level, index, transform, stage):
+    """One Gauss-Newton step as a motion, its equations summed in float64."""
+    moving = jnp.asarray(transform, jnp.float32)
+    system, pull = np.zeros((6, 6)), np.zeros(6)
+    for start in range(0, len(index), _ROWS):
+        rows, partners = np.s_[start : start + _ROWS], index[start : start + _ROWS]
+        pad = ((0, _ROWS - len(partners)), (0, 0))
+        parts = (
+            np.pad(part, pad)
+            for part in (
+                level.source[rows],
+                level.source_normals[rows],
+                level.target[partners],
+                level.target_normals[partners],
+            )
+        )
+        more = _equations(*parts, np.arange(_ROWS) < len(partners), moving, stage)
+        system, pull = system + np.asarray(more[0]), pull + np.asarray(more[1])
+    return np.asarray(_step(system.astype(np.float32), pull.astype(np.float32)), np.float64)
+
+
+@jax.jit
+def _step(system: Array, pull: Array) -> Array:
+    return rigid.exp(generalized_icp.solve(system, pull))
+
+
+@jax.jit
+def _equations(
+    points: Array, normals: Array, partners: Array, partner_normals: Array, mask: Array,
+    transform: Array, stage: Stage,
+) -> tuple[Array, Array]:  # fmt: skip
+    surface = Surface(points, normals, mask)
+    return generalized_icp.normal_equations(surface, partners, partner_normals, transform, stage)
+
+
+def _score(level, transform, cut):
+    """`generalized_icp.score` by the tree."""
+    distance, _ = _pairs(level, transform, cut)
+    return float(np.mean(1 - (1 - np.minimum(distance / cut, 1) ** 2) ** 3))
+
+
+def _fit(level, transform):
+    distance, _ = _pairs(level, transform, DISTANCE)
+    near = distance[np.isfinite(distance)]
+    rmse = float(np.sqrt(np.mean(near**2))) if len(near) else 0.0
+    return len(near) / len(distance), rmse

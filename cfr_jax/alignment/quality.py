@@ -1,0 +1,167 @@
+"""How good a registration is, and whether the clouds determine it at all, without the truth."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from cfr_jax.geometry import rigid
+from cfr_jax.geometry.neighbors import closest
+from cfr_jax.refine.generalized_icp import Surface
+
+_HIGHEST = lax.Precision.HIGHEST
+_NUDGE = 0.15  # radians and units of the unit sphere; three times the usual inlier distance
+_TEXTURE = 0.06  # nudges as small as this feel the sampling: where the points lie on the surface
+_LEAST = 0.2  # where less of the fit is left to lose, a rise is chance
+_POINTWISE = 1e-3  # share of point-to-point information: settles what normals leave open
+_WEAKEST = 3  # a plane slides along two axes and turns about one; a ball turns about three
+
+
+@struct.dataclass
+class Quality:
+    """Measured in the unit sphere, under the answer's transform."""
+
+    fitness: Float[Array, ""]
+    """Share of the source with a target point within the inlier distance."""
+    inlier_rmse: Float[Array, ""]
+    """Root mean square distance of those; 0 where there are none."""
+    resistance: Float[Array, " w"]
+    """How much the fit suffers from a nudge along each of the weakest directions: about 0 not at
+    all (the clouds slide or turn freely), 1 all of it is lost."""
+    weakest: Float[Array, "w 6"]
+    """Those directions: twists in the target's frame, rotation first, of unit length."""
+    overlap: Float[Array, ""]
+    """Share of the source that the target seems to have seen, too."""
+    moments: Float[Array, "4 4"]
+    """Sum of [y; 1][y; 1]' over the target points that lie closest to the inliers."""
+
+
+def measure(
+    source: Surface,
+    target: Surface,
+    transform: Float[Array, "4 4"],
+    distance: float,
+    spacing: Float[Array, ""],
+) -> Quality:
+    """Fitness, inlier error, overlap and determinedness of `transform` (source onto target).
+
+    The overlap counts the points of the source with a target point closer than twice the target's
+    `spacing`: on 78 partial, noisy validation pairs under the truth that was 0.02 off the true
+    overlap in the mean, and no more than 0.006 too high.
+
+    The weakest directions are the eigenvectors with the smallest eigenvalues of the point-to-plane
+    information matrix (geometric stability: Gelfand et al., 2003), to which a little point-to-point
+    information is added: of directions that no normal resists, those that move the fewest points
+    come first (a line turns about itself before it slides). Noise in the normals hides a free
+    direction from its eigenvalue, so each is tried: the source is nudged both ways along it, and
+    the rise of the truncated score is compared with all it could rise. It is measured from a small
+    nudge on, not from rest: leaving the place where the samples happen to meet costs something on
+    any surface.
+    """
+    moved = rigid.apply(transform, source.points)
+    found = closest(moved, target.points, target.mask)
+    inlier = (found.square <= distance**2) & source.mask
+    counted = inlier.astype(moved.dtype)
+    count = jnp.sum(counted)
+    valid = jnp.maximum(jnp.sum(source.mask, dtype=count.dtype), 1)
+    seen = source.mask & (found.square <= (2 * spacing) ** 2)
+    partners = target.points[found.index]
+    partners = jnp.concatenate([partners, jnp.ones_like(partners[:, :1])], axis=1)
+    rmse = jnp.sqrt(jnp.sum(jnp.where(inlier, found.square, 0)) / jnp.maximum(count, 1))
+
+    normals = target.normals[found.index]
+    rows = jnp.concatenate([jnp.cross(moved, normals), normals], axis=1)
+    information = jnp.matmul(rows.T, rows * counted[:, None], precision=_HIGHEST)
+    information += _POINTWISE * _pointwise_information(moved, counted)
+    _, directions = jnp.linalg.eigh(information)  # ascending
+    weakest = directions[:, :_WEAKEST].T
+
+    def resistance(direction):
+        def nudged(step):
+            motion = rigid.exp(step * direction)
+            return _truncated(source, target, rigid.compose(motion, transform), distance)
+
+        steps = jnp.array([-_TEXTURE, _TEXTURE, -_NUDGE, _NUDGE], moved.dtype)
+        near_back, near_ahead, back, ahead = lax.map(nudged, steps)
+        near = (near_back + near_ahead) / 2
+        rise = jnp.minimum(back, ahead) - near
+        return jnp.clip(rise / jnp.maximum(1 - near, _LEAST), 0, 1)
+
+    return Quality(
+        fitness=count / valid,
+        inlier_rmse=rmse,
+        resistance=lax.map(resistance, weakest),
+        weakest=weakest,
+        overlap=jnp.sum(seen, dtype=count.dtype) / valid,
+        moments=jnp.matmul(partners.T, partners * counted[:, None], precision=_HIGHEST),
+    )
+
+
+def spacing(
+    points: Float[Array, "m 3"], neighbors: Int[Array, "m k"], mask: Bool[Array, " m"]
+) -> Float[Array, ""]:
+    """Median distance of a point to the nearest of its neighbors."""
+    offset = points[neighbors] - points[:, None]
+    nearest = jnp.sqrt(jnp.min(jnp.sum(offset * offset, axis=2), axis=1))
+    return jnp.nanmedian(jnp.where(mask, nearest, jnp.nan))
+
+
+def information_matrix(
+    moments: Float[np.ndarray, "4 4"], center: Float[np.ndarray, " 3"], scale: float
+) -> Float[np.ndarray, "6 6"]:
+    """Open3D's information matrix of the inliers, for a target y = center + scale * unit; float64.
+
+    Sum of J'J over the target's points, J how a twist (rotation first, then translation) moves one,
+    as Choi, Zhou & Koltun (2015) use it in pose graphs. It follows from the `moments` of the unit
+    cloud, so that no point is looked at again.
+    """
+    to_caller = np.diag([scale, scale, scale, 1.0])
+    to_caller[:3, 3] = center
+    moments = to_caller @ np.asarray(moments, np.float64) @ to_caller.T
+    second, (x, y, z), count = moments[:3, :3], moments[:3, 3], moments[3, 3]
+    turn = np.trace(second) * np.eye(3) - second
+    lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.block([[turn, lever], [lever.T, count * np.eye(3)]])
+
+
+def mutual_fit(
+    source: Surface, target: Surface, transform: Float[Array, "4 4"], reach: float
+) -> Float[Array, ""]:
+    """How well two clouds lie on each other under `transform` (source onto target), in [0, 1].
+
+    The mean over both clouds of 1 - d^2 / reach^2 (Epanechnikov; zero beyond `reach`), d the
+    distance to the closest point of the other cloud, times the cosine between the two normals (zero
+    where they oppose). Unlike the fitness it sees when a small part lies on a large one anywhere,
+    or when a thin shape is turned over.
+    """
+
+    def covered(first, second, motion):
+        found = closest(rigid.apply(motion, first.points), second.points, second.mask)
+        normals = rigid.rotate(motion, first.normals)
+        cosine = jnp.sum(normals * second.normals[found.index], axis=1)
+        near = jnp.maximum(1 - found.square / reach**2, 0)
+        valid = first.mask.astype(near.dtype)
+        return jnp.sum(near * jnp.maximum(cosine, 0) * valid) / jnp.maximum(jnp.sum(valid), 1)
+
+    there = covered(source, target, transform)
+    return (there + covered(target, source, rigid.invert(transform))) / 2
+
+
+def _truncated(source, target, transform, distance):
+    """Mean over the source of the squared distance to the target, truncated; in [0, 1]."""
+    found = closest(rigid.apply(transform, source.points), target.points, target.mask)
+    truncated = jnp.minimum(found.square / distance**2, 1)
+    valid = source.mask.astype(truncated.dtype)
+    return jnp.sum(truncated * valid) / jnp.maximum(jnp.sum(valid), 1)
+
+
+def _pointwise_information(points, weights):
+    """Sum of J'J, J how a twist (turn, slide) moves a point: turn x p + slide."""
+    turn = -jax.vmap(rigid.skew)(points)
+    slide = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), turn.shape)
+    jacobian = jnp.concatenate([turn, slide], axis=2) * weights[:, None, None]
+    return jnp.einsum("nji,njk->ik", jacobian, jacobian, precision=_HIGHEST)

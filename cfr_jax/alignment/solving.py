@@ -1,0 +1,140 @@
+"""What `align` runs on the device: the network, the refinement, and what their answer is worth.
+
+Pure functions of one pair of unit clouds; batches are `vmap`.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from cfr_jax.alignment import confidence, quality
+from cfr_jax.alignment.planning import CASCADES, SETTINGS
+from cfr_jax.geometry.units import UnitCloud
+from cfr_jax.networks.cfr.iterations import Encoded
+from cfr_jax.networks.cfr.registration import Registration, encode, register
+from cfr_jax.networks.clouds import Cloud, prepare
+from cfr_jax.networks.clues import NetworkClues
+from cfr_jax.refine import generalized_icp
+from cfr_jax.refine.generalized_icp import Surface, score
+from cfr_jax.runtime import programs
+
+DISTANCE = generalized_icp.CUT
+
+
+@struct.dataclass
+class Found:
+    """What comes back from the device; batched after `vmap`."""
+
+    registration: Registration
+    transform: Float[Array, "*batch 4 4"]
+    """Maps the source, as it was handed over, onto the target."""
+    improved: Bool[Array, "*batch"]
+    """Whether `transform` is not the network's last, but one that fits no worse."""
+    converged: Bool[Array, "*batch"]
+    steps: Int[Array, "*batch"]
+    quality: quality.Quality
+    clues: confidence.Clues
+
+
+programs.storable(
+    Cloud,
+    Encoded,
+    Registration,
+    Found,
+    quality.Quality,
+    confidence.Clues,
+    NetworkClues,
+)
+
+
+def solve(params: dict, source: Cloud, target: Encoded, *, refine: bool) -> Found:
+    """The device's part for one pair of unit clouds: registered, refined, judged.
+
+    Refining never answers worse, by its own score, than the network did or than the source lay
+    when it came: a start that fits better than all that was found from it stands.
+    """
+    registration = register(params, source, target, cascades=CASCADES, settings=SETTINGS)
+    surfaces = surface(source), surface(target.cloud)
+    transform = registration.transform
+    improved = converged = jnp.array(False)
+    steps = jnp.zeros((), jnp.int32)
+    if refine:
+        refined = generalized_icp.refine(*surfaces, transform)
+        start = jnp.eye(4, dtype=transform.dtype)
+        kept, moved = (score(*surfaces, motion, DISTANCE) for motion in (start, refined.transform))
+        stays = kept < moved
+        transform = jnp.where(stays, start, refined.transform)
+        improved, steps = refined.improved | stays, refined.steps
+        converged = refined.converged
+    measured, clues = _judge(registration, transform, target.cloud, surfaces)
+    return Found(registration, transform, improved, converged, steps, measured, clues)
+
+
+@jax.jit
+def replaced(
+    source: dict[str, jax.Array],
+    target: dict[str, jax.Array],
+    found: Found,
+    transform: Float[Array, "4 4"],
+    converged: Bool[Array, ""],
+    steps: Int[Array, ""],
+) -> Found:
+    """`found` with another refinement's `transform` instead, unless that fits worse."""
+    source, target = (prepare(**cloud, settings=SETTINGS) for cloud in (source, target))
+    surfaces = surface(source), surface(target)
+    before, after = (score(*surfaces, motion, DISTANCE) for motion in (found.transform, transform))
+    improved = after <= before
+    transform = jnp.where(improved, transform, found.transform)
+    measured, clues = _judge(found.registration, transform, target, surfaces)
+    return Found(found.registration, transform, improved, converged, steps, measured, clues)
+
+
+def _judge(registration, transform, target, surfaces):
+    spacing = quality.spacing(target.points, target.neighbors, surfaces[1].mask)
+    measured = quality.measure(*surfaces, transform, DISTANCE, spacing)
+    return measured, confidence.gather(
+        registration.clues, registration.transform, transform, measured
+    )
+
+
+def surface(cloud: Cloud) -> Surface:
+    """A prepared cloud as the refinement sees it."""
+    mask = jnp.ones(cloud.points.shape[0], bool) if cloud.mask is None else cloud.mask
+    return Surface(cloud.points, cloud.normals, mask)
+
+
+def on_device(unit: UnitCloud) -> dict[str, jax.Array]:
+    """The arguments of `prepared.prepare` for a unit cloud."""
+    points = unit.points if unit.normals is None else np.hstack([unit.points, unit.normals])
+    # not jnp.asarray, which compiles a copy of each shape
+    return jax.device_put({"points": points, "neighbors": unit.neighbors, "mask": unit.mask})
+
+
+@functools.partial(jax.jit, static_argnames=("refine",))
+def solve_pair(
+    params: dict, source: dict[str, jax.Array], target: dict[str, jax.Array], *, refine: bool
+) -> Found:
+    """`solve` for two clouds as `on_device` hands them over."""
+    source, target = (prepare(**cloud, settings=SETTINGS) for cloud in (source, target))
+    return solve(params, source, encode(params, target, settings=SETTINGS), refine=refine)
+
+
+def timed(seconds: dict[str, float], function: Callable, *arguments: Any, **static: Any) -> Any:
+    """What a jitted function answers, when it is there; adds what that took to the `seconds` of
+    "compile" and of "run"."""
+    began = time.perf_counter()
+    program = programs.compiled(function, *arguments, **static)
+    ready = time.perf_counter()
+    answer = jax.block_until_ready(program(*arguments))
+    seconds["compile"] += ready - began
+    seconds["run"] += time.perf_counter() - ready
+    return answer

@@ -1,0 +1,41 @@
+"""Compiled programs kept between calls: compiling takes seconds, registering a fraction of one."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+
+
+def keep_compiled_programs() -> None:
+    """Turns JAX's compilation cache on, in the user's cache folder.
+
+    `CFR_JAX_CACHE` names another folder, or is "off". A cache that JAX was already told of
+    (`JAX_COMPILATION_CACHE_DIR`) stays as it is. Without a folder to write to, calls are slower
+    and nothing else.
+    """
+    import jax
+
+    wish = os.environ.get("CFR_JAX_CACHE", "")
+    if wish == "off" or jax.config.values["jax_compilation_cache_dir"] is not None:
+        return
+    try:
+        folder = Path(wish) if wish else _user_folder()
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # a file in the way, a read-only home, no home
+        return
+    if not os.access(folder, os.W_OK):
+        return
+    # A damaged or unwritable entry only costs time, which the JSON tells.
+    warnings.filterwarnings("ignore", message=".*persistent compilation cache")
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    # imported here: it takes JAX along
+    from cfr_jax.runtime import programs
+
+    programs.keep_in(folder)
+
+
+def _user_folder() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME")
+    return (Path(home) if home else Path.home() / ".cache") / "cfr_jax"

@@ -1,0 +1,179 @@
+"""A registration with what it came from, and its three forms: text, JSON document, scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import ArrayLike
+
+from cfr_jax import __version__
+from cfr_jax.alignment.align import Initial, align
+from cfr_jax.alignment.answers import Alignment
+from cfr_jax.io import PointCloud
+from cfr_jax.viewer import Scene
+from cfr_jax.weights.files import DEFAULT, Weights, read_weights
+
+FORMAT = "cfr_jax/register/1"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What went in and what came out."""
+
+    source: PointCloud
+    target: PointCloud
+    initial: Float64[np.ndarray, "4 4"] | None
+    seed: int
+    weights: Weights
+    alignment: Alignment
+
+    def moved_source(self) -> PointCloud:
+        """The whole source, laid on the target."""
+        rotation, translation = self.alignment.transform[:3, :3], self.alignment.transform[:3, 3]
+        normals = None if self.source.normals is None else self.source.normals @ rotation.T
+        return PointCloud(self.source.points @ rotation.T + translation, normals, self.source.name)
+
+
+def register(
+    source: PointCloud,
+    target: PointCloud,
+    *,
+    weights: str | None = None,
+    refine: bool | Literal["small_gicp"] = True,
+    initial: Initial = None,
+    max_points: int | None = None,
+    all_points: bool = False,
+    second_look: bool = True,
+    seed: int = 0,
+) -> Result:
+    """`align` with weights by name or path; raises ValueError as `align` and `read_weights` do."""
+    chosen = read_weights(DEFAULT if weights is None else weights, "cfr")
+    alignment = align(
+        source,
+        target,
+        params=chosen.params,
+        refine=refine,
+        initial=initial,
+        max_points=max_points,
+        all_points=all_points,
+        second_look=second_look,
+        seed=seed,
+    )
+    return Result(source, target, alignment.initial, seed, chosen, alignment)
+
+
+def as_document(result: Result, source_path: str, target_path: str) -> dict[str, Any]:
+    """Everything that is known, as `register.schema.json` describes it."""
+    found = result.alignment
+    return {
+        "format": FORMAT,
+        "version": __version__,
+        "source": _cloud(result.source, source_path, len(found.source_rows)),
+        "target": _cloud(result.target, target_path, len(found.target_rows)),
+        "transform": found.transform.tolist(),
+        "transforms": found.transforms.tolist(),
+        "initial": None if result.initial is None else result.initial.tolist(),
+        "starts": found.starts,
+        "alternatives": found.alternatives.tolist(),
+        "refined": found.refined,
+        "converged": found.converged,
+        "steps": found.steps,
+        "trusted": found.trusted,
+        "determined": found.determined,
+        "confidence": found.confidence,
+        "fitness": found.fitness,
+        "inlier_rmse": found.inlier_rmse,
+        "inlier_distance": found.inlier_distance,
+        "overlap": found.overlap,
+        "information": found.information.tolist(),
+        "warnings": list(found.warnings),
+        "neighbors": found.neighbors,
+        "seed": result.seed,
+        "weights": {"name": result.weights.name, "sha256": result.weights.sha256},
+        "seconds": found.seconds,
+    }
+
+
+def as_text(result: Result) -> str:
+    """The transform and its quality, for people."""
+    found = result.alignment
+    rotation, translation = found.transform[:3, :3], found.transform[:3, 3]
+    # by the chord |R - 1|: scipy's rotations take a twelfth of the command's time to import
+    chord = float(np.linalg.norm(rotation - np.eye(3)))
+    angle = np.degrees(2 * np.arcsin(min(chord / 8**0.5, 1.0)))
+    verdict = "trusted" if found.trusted else "not trusted"
+    if not found.determined:
+        verdict += ", not determined"
+    lines = [
+        f"source      {result.source.name}: {_counts(result.source, len(found.source_rows))}",
+        f"target      {result.target.name}: {_counts(result.target, len(found.target_rows))}",
+        "transform   source onto target, T @ [x; 1]:",
+        *("    " + _row(row) for row in found.transform),
+        f"motion      {angle:.3f}° about one axis, translation {np.linalg.norm(translation):.6g}",
+        *(f"{name:<11} {text}" for name, text in quality(found).items()),
+        f"verdict     {verdict}",
+        *(f"warning     {text}" for text in found.warnings),
+        "time        {run:.3f} s, and {compile:.1f} s to compile".format(**found.seconds),
+    ]
+    return "\n".join(lines)
+
+
+def quality(found: Any) -> dict[str, str]:
+    """The figures a reader judges by, of an `Alignment` or of what has the same ones, written
+    out."""
+    return {
+        "confidence": f"{found.confidence:.2f}",
+        "fitness": f"{found.fitness:.3f} of the source within {found.inlier_distance:.4g}",
+        "inlier RMSE": f"{found.inlier_rmse:.4g}",
+        "refined": "yes" if found.refined else "no",
+    }
+
+
+def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
+    """The way from the start to the answer, with `facts` before the figures of quality."""
+    found = result.alignment
+    stations, labels = way(
+        result.initial, found.transforms, found.transform if found.refined else None
+    )
+    weights = np.full(len(result.source), np.nan)  # NaN: a point the network did not see
+    weights[found.source_rows] = found.weights
+    return Scene(
+        source=result.source.points,
+        target=result.target.points,
+        transforms=stations,
+        labels=labels,
+        weights=weights,
+        facts={**(facts or {}), **quality(found)},
+        source_name=result.source.name,
+        target_name=result.target.name,
+        warnings=found.warnings,
+    )
+
+
+def way(
+    initial: ArrayLike | None, transforms: Iterable[ArrayLike], refined: ArrayLike | None
+) -> tuple[list[Any], list[str]]:
+    """The stations of the motion, each (4, 4), and what they are called."""
+    stations = [np.eye(4) if initial is None else initial, *transforms]
+    labels = ["start", *(f"iteration {i}" for i in range(1, len(stations)))]
+    if refined is not None:
+        stations.append(refined)
+        labels.append("refined")
+    return stations, labels
+
+
+def _cloud(cloud: PointCloud, path: str, used: int) -> dict[str, Any]:
+    return {"name": cloud.name, "path": path, "points": len(cloud), "used": used}
+
+
+def _counts(cloud: PointCloud, used: int) -> str:
+    return f"{len(cloud):,} points, {used:,} used"
+
+
+def _row(row: Float64[np.ndarray, " 4"]) -> str:
+    # Twelve digits: a millimeter at map coordinates, and more than a rotation needs.
+    return " ".join(f"{value:17.12g}" for value in row)

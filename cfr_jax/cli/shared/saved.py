@@ -1,0 +1,131 @@
+"""A result that `cfr register --json` wrote, and the clouds it speaks of: ready to be drawn."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cfr_jax import io
+from cfr_jax.cli.shared import report
+from cfr_jax.io import PointCloud
+from cfr_jax.viewer import Scene
+
+_LARGEST_FILE = 1 << 26  # bytes; a result has a few thousand
+_NEEDED: dict[str, type | tuple[type, ...]] = {
+    "source": dict,
+    "target": dict,
+    "transform": list,
+    "transforms": list,
+    "refined": bool,
+    "fitness": (int, float),
+    "inlier_distance": (int, float),
+    "warnings": list,
+    "seed": int,
+}
+_COMPARED = 2_000  # points of the source whose distances are taken again
+# The result measured thinned clouds, and here all points are: a good fit may look a little better
+# or worse, a changed file looks like another one.
+_WORSE = 0.25
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """The document in `path`; raises ValueError, naming the file, for anything else."""
+    try:
+        if path.is_dir():
+            raise ValueError("is a folder")
+        if path.stat().st_size > _LARGEST_FILE:
+            raise ValueError("is too large for one")
+        document = json.loads(path.read_bytes())
+        if not isinstance(document, dict):
+            raise ValueError(f"holds a {type(document).__name__}")
+        if document.get("format") != report.FORMAT:
+            raise ValueError(f"its format is {document.get('format')!r}, not {report.FORMAT!r}")
+        for name, kind in _NEEDED.items():
+            if not isinstance(document.get(name), kind):
+                raise ValueError(f'has no usable "{name}"')
+        for role in ("source", "target"):
+            if not isinstance(document[role].get("path"), str):
+                raise ValueError(f'does not say where its "{role}" lies')
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: wanted what `cfr register --json` wrote: {error}") from error
+    return document
+
+
+def find_cloud(document: dict[str, Any], role: str, result: Path, given: Path | None) -> Path:
+    """Where the `role` ("source" or "target") of `document` lies now.
+
+    `given` if there is one; else the path in the document, from here or from the folder of the
+    result. Raises ValueError if the file is in neither place.
+    """
+    if given is not None:
+        return given
+    noted = Path(document[role]["path"])
+    for place in (noted, result.parent / noted, result.parent / noted.name):
+        if place.exists():
+            return place
+    raise ValueError(
+        f"{role}: {noted}, which {result.name} is about, is not there any more, nor beside it; "
+        f"--{role} FILE says where it lies now"
+    )
+
+
+def read_clouds(document: dict[str, Any], paths: dict[str, Path]) -> dict[str, PointCloud]:
+    """The two clouds, sampled as they were; ValueError if one has other points than it had."""
+    clouds = {role: io.read(path, seed=document["seed"]) for role, path in paths.items()}
+    for role, cloud in clouds.items():
+        had = document[role].get("points", len(cloud))
+        if len(cloud) != had:
+            raise ValueError(
+                f"{role}: {paths[role]} has {len(cloud):,} points, the result is about {had}: "
+                f"another file? --{role} FILE names the right one"
+            )
+    return clouds
+
+
+def as_scene(document: dict[str, Any], source: PointCloud, target: PointCloud) -> Scene:
+    """What `report.as_scene` drew of the same result, without the correspondence weights, which
+    are not saved. Raises ValueError for transforms that are none."""
+    stations, labels = report.way(
+        document.get("initial"),
+        document["transforms"],
+        document["transform"] if document["refined"] else None,
+    )
+    try:
+        facts = report.quality(SimpleNamespace(**document))
+        scene = Scene(
+            source=source.points,
+            target=target.points,
+            transforms=stations,
+            labels=labels,
+            facts=facts,
+            source_name=source.name,
+            target_name=target.name,
+            warnings=[str(text) for text in [*_doubts(document, source, target)]],
+        )
+    except (TypeError, AttributeError) as error:
+        raise ValueError(f"the result cannot be drawn: {error}") from error
+    return scene
+
+
+def _doubts(document, source, target):
+    """The warnings of the result, and one more if its clouds do not fit as they did."""
+    yield from document["warnings"]
+    rows = np.random.default_rng(0).permutation(len(source))[:_COMPARED]
+    transform = np.asarray(document["transform"], np.float64)
+    if transform.shape != (4, 4) or not np.isfinite(transform).all():
+        return  # the scene says so
+    moved = source.points[rows] @ transform[:3, :3].T + transform[:3, 3]
+    away = cKDTree(target.points).query(moved)[0]
+    fitness = float((away <= document["inlier_distance"]).mean())
+    if fitness < document["fitness"] - _WORSE:
+        yield (
+            f"the clouds do not fit as they did (fitness {fitness:.2f}, and it was "
+            f"{document['fitness']:.2f}): were the files changed?"
+        )

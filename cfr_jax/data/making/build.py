@@ -1,0 +1,189 @@
+"""Builds a corpus from meshes: each sampled, judged, held against the others, written to HDF5.
+
+What is written depends on the meshes and their names alone.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from cfr_jax.data.making.duplicates import drop_duplicates
+from cfr_jax.data.making.meshes import SUFFIXES, read_mesh
+from cfr_jax.data.making.samples import RECIPE, Item, sampled
+from cfr_jax.data.making.shapes import Shape, name_share
+from cfr_jax.runtime.atomic import unfinished, write_atomically
+from cfr_jax.runtime.progress import Progress
+
+VALIDATION_SHARE = 0.2
+ENOUGH = 30  # to validate on: with fewer, which weights are best is a matter of chance
+SPLITS = ("train", "val", "test")
+
+
+@dataclass
+class Report:
+    """What came of a build."""
+
+    counts: dict[str, Counter[str]] = field(default_factory=dict)  # split → category → shapes
+    left_out: dict[str, str] = field(default_factory=dict)  # name → why
+    left_out_file: Path | None = None  # which tells that, where anything was
+
+    @property
+    def shapes(self) -> int:
+        return sum(sum(counts.values()) for counts in self.counts.values())
+
+    @property
+    def reasons(self) -> Counter[str]:
+        """How many shapes were left out for what; of `repeats OTHER` only the first word."""
+        return Counter(
+            "repeats another" if why.startswith("repeats ") else why
+            for why in self.left_out.values()
+        )
+
+
+def folder_items(folder: Path, least_faces: int = 20) -> list[Item]:
+    """Every mesh below a folder, its first folder for a category (the folder's name if none).
+
+    Raises ValueError where there is none.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"no folder {folder} to take meshes from")
+    paths = sorted(
+        path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()
+    )
+    if not paths:
+        raise ValueError(f"no mesh below {folder}: wanted files that end in {' '.join(SUFFIXES)}")
+    items = []
+    for path in paths:
+        inside = path.relative_to(folder)
+        category = inside.parts[0] if len(inside.parts) > 1 else folder.resolve().name
+        stat = path.stat()
+        items.append(
+            Item(
+                name=inside.as_posix(),
+                category=category,
+                load=partial(read_mesh, path),
+                least_faces=least_faces,
+                stamp=f"{stat.st_size} {stat.st_mtime_ns}",
+            )
+        )
+    return items
+
+
+def choose_unseen(categories: Sequence[str]) -> tuple[str, ...]:
+    """Half of the categories (rounded down), by a hash of their names."""
+    shuffled = sorted(set(categories), key=lambda category: name_share(category, "half"))
+    return tuple(sorted(shuffled[: len(shuffled) // 2]))
+
+
+def split_of(name: str, unseen: bool) -> str:
+    """Shapes of unseen categories are for the test; of the others the name's hash picks a fifth
+    for validation."""
+    if unseen:
+        return "test"
+    return "val" if name_share(name, "split") < VALIDATION_SHARE else "train"
+
+
+def build(
+    items: Sequence[Item],
+    out: Path,
+    unseen: Sequence[str] | None,
+    points: int = 2048,
+    quiet: bool = False,
+    categories: Sequence[str] | None = None,
+) -> Report:
+    """Writes a corpus: `train.h5`, `val.h5`, `test.h5` into the folder `out`, or all shapes into
+    one file `out` if `unseen` is None. Beside come `shape_names.txt`, and `left_out.txt` (of one
+    file `NAME.left_out.txt`) with what was left out and why.
+
+    Labels are places among `categories`, sorted; by default those that occur. Raises ValueError
+    where no item is fit, or where items share a name.
+    """
+    categories = sorted(set(categories or ()) | {item.category for item in items})
+    unknown = sorted(set(unseen or ()) - set(categories))
+    if unknown:
+        raise ValueError(f"unseen: no mesh is of the categories {unknown}; there are {categories}")
+    repeated = [name for name, times in Counter(item.name for item in items).items() if times > 1]
+    if repeated:
+        raise ValueError(f"items: {len(repeated)} names occur twice, {repeated[0]!r} for one")
+
+    held_back = frozenset(unseen or ())
+    work = out.with_name(f".{out.name}.work")
+    report = Report()
+    kept: list[Item] = []
+    shapes: list[Shape] = []
+    for item, made in sampled(items, points, work, quiet):
+        if isinstance(made, str):
+            report.left_out[item.name] = made
+        else:
+            kept.append(item)
+            shapes.append(made)
+
+    def bar(pairs):
+        return Progress(pairs, desc="comparing", unit=" pairs", disable=quiet)
+
+    dropped = drop_duplicates(shapes, [item.category not in held_back for item in kept], bar)
+    for row, other in dropped.items():
+        report.left_out[kept[row].name] = f"repeats {kept[other].name}"
+    # An order by hash, so that the first rows are a fair sample of the whole.
+    rows = sorted(
+        (row for row in range(len(kept)) if row not in dropped),
+        key=lambda row: name_share(kept[row].name, "order"),
+    )
+    if not rows:
+        raise ValueError(f"none of {len(items)} meshes is fit for a corpus: {dict(report.reasons)}")
+
+    single = unseen is None
+    folder = out.parent if single else out
+    folder.mkdir(parents=True, exist_ok=True)
+    names = "".join(f"{name}\n" for name in categories)
+    write_atomically(folder / "shape_names.txt", names.encode())
+    for split in ("all",) if single else SPLITS:
+        chosen = [
+            row for row in rows
+            if single or split == split_of(kept[row].name, kept[row].category in held_back)
+        ]  # fmt: skip
+        report.counts[split] = Counter(kept[row].category for row in chosen)
+        if chosen:  # a corpus of no shapes is no corpus
+            path = out if single else out / f"{split}.h5"
+            _write_corpus(path, [kept[row] for row in chosen], [shapes[row] for row in chosen],
+                          categories, split)  # fmt: skip
+    left_out = folder / (f"{out.stem}.left_out.txt" if single else "left_out.txt")
+    left_out.unlink(missing_ok=True)
+    if report.left_out:
+        lines = (f"{name}: {why}\n" for name, why in sorted(report.left_out.items()))
+        write_atomically(left_out, "".join(lines).encode())
+        report.left_out_file = left_out
+    shutil.rmtree(work, ignore_errors=True)
+    return report
+
+
+def _write_corpus(
+    path: Path, items: Sequence[Item], shapes: Sequence[Shape], categories: list[str], split: str
+) -> None:
+    """The layout of `modelnet40_ply_hdf5_2048`, with names, half-precision points, int8 normals."""
+    data = np.stack([shape.points for shape in shapes]).astype(np.float16)
+    normal = np.round(np.stack([shape.normals for shape in shapes]) * 127).astype(np.int8)
+    labels = np.array([[categories.index(item.category)] for item in items])
+    chunks = (min(32, len(data)), *data.shape[1:])
+    # No times and no tracking of anything: the same corpus is the same bytes.
+    with (
+        unfinished(path) as beside,
+        h5py.File(beside, "w", libver="v110", track_order=False) as file,
+    ):
+        packed = {"chunks": chunks, "compression": "gzip", "track_times": False}
+        file.create_dataset("data", data=data, **packed)
+        file.create_dataset("normal", data=normal, **packed).attrs["scale"] = 1 / 127
+        kind = np.uint8 if len(categories) <= 256 else np.uint16
+        file.create_dataset("label", data=labels.astype(kind), track_times=False)
+        names = [item.name for item in items]
+        file.create_dataset("names", data=names, dtype=h5py.string_dtype(), track_times=False)
+        file.attrs["split"] = split
+        file.attrs["recipe"] = RECIPE

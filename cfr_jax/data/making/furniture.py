@@ -1,0 +1,119 @@
+"""SH3F, the furniture libraries of Sweet Home 3D: a zip file of OBJ models with a catalogue.
+
+The catalogue, `PluginFurnitureCatalog.properties`, has lines `key#INDEX=value`; the lines of one
+INDEX describe one piece. A model is an OBJ file in the zip, or a zip in the zip with one in it.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cfr_jax.io.formats.surfaces import parse_obj
+from cfr_jax.io.mesh import Mesh
+
+CATALOGUE = "PluginFurnitureCatalog.properties"
+LARGEST_MODEL = 1 << 28  # bytes; a zip may promise to unpack to any size
+
+_LINE = re.compile(r"(\w+)#(\d+)\s*[=:]\s*(.*)")
+_ESCAPE = re.compile(r"\\(u[0-9a-fA-F]{4}|.)")
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One entry of a catalogue. The identifier is unique within its library."""
+
+    identifier: str
+    name: str
+    category: str
+    creator: str
+    model: str  # path in the zip
+    size: tuple[float, float, float]  # width, height, depth (x, y, z) in meters
+
+    def scaled(self, mesh: Mesh) -> Mesh:
+        """The mesh in meters at its true size, y up, the middle of its box at the origin."""
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        scale = np.array(self.size) / np.where(high > low, high - low, 1.0)
+        return Mesh((mesh.vertices - (low + high) / 2) * scale, mesh.triangles, mesh.name)
+
+
+class FurnitureLibrary:
+    """An open SH3F file; close it, or use it in a `with` statement."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        try:
+            self._zip = zipfile.ZipFile(path)
+            text = self._zip.read(CATALOGUE).decode("latin1")
+        except (OSError, zipfile.BadZipFile, KeyError) as error:
+            raise ValueError(f"{path} is not a furniture library (SH3F): {error}") from error
+        self.pieces = _pieces(text, path)
+
+    def __enter__(self) -> FurnitureLibrary:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._zip.close()
+
+    def mesh(self, piece: Piece) -> Mesh:
+        """The model of a piece, in the units of its file (see `Piece.scaled`)."""
+        return parse_obj(_model(self._zip, piece.model, self.path), piece.identifier)
+
+
+def _pieces(text: str, path: Path) -> tuple[Piece, ...]:
+    entries: dict[int, dict[str, str]] = {}
+    for line in text.splitlines():
+        if match := _LINE.match(line.strip()):
+            key, index, value = match.groups()
+            entries.setdefault(int(index), {})[key] = _ESCAPE.sub(_unescaped, value.strip())
+    pieces = []
+    for index, entry in sorted(entries.items()):
+        missing = [key for key in ("name", "model", "width", "depth", "height") if key not in entry]
+        if missing:
+            raise ValueError(f"{path}: entry {index} of the catalogue lacks {missing}")
+        try:
+            width, depth, height = (float(entry[key]) for key in ("width", "depth", "height"))
+        except ValueError:
+            raise ValueError(f"{path}: entry {index} has a size that is no number") from None
+        pieces.append(
+            Piece(
+                identifier=entry.get("id", f"{index}"),
+                name=entry["name"],
+                category=entry.get("category", ""),
+                creator=entry.get("creator", ""),
+                model=entry["model"].lstrip("/"),
+                size=(width / 100, height / 100, depth / 100),
+            )
+        )
+    return tuple(pieces)
+
+
+def _unescaped(match: re.Match[str]) -> str:
+    code = match[1]
+    return chr(int(code[1:], 16)) if len(code) == 5 else code
+
+
+def _model(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
+    try:
+        data = _content(archive, name)
+        if not zipfile.is_zipfile(io.BytesIO(data)) or name.lower().endswith(".obj"):
+            return data
+        with zipfile.ZipFile(io.BytesIO(data)) as nested:
+            models = [inner for inner in nested.namelist() if inner.lower().endswith(".obj")]
+            if not models:
+                raise ValueError(f"{path}: {name} holds no OBJ file")
+            return _content(nested, models[0])
+    except (KeyError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: cannot read {name}: {error}") from error
+
+
+def _content(archive: zipfile.ZipFile, name: str) -> bytes:
+    size = archive.getinfo(name).file_size
+    if size > LARGEST_MODEL:
+        raise ValueError(f"{name} unpacks to {size} bytes, wanted {LARGEST_MODEL} at most")
+    return archive.read(name)

@@ -1,0 +1,213 @@
+"""Triangle meshes from files, also of the games and simulators that open corpora come from.
+
+PMD (0 A.D.) and AC3D (FlightGear) are parsed here; common formats by `cfr_jax.io`.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from cfr_jax.io.formats import gltf, ply, surfaces
+from cfr_jax.io.mesh import Mesh, fan_triangles
+
+_PMD_START = struct.Struct("<4sIIII")  # mark, version, size of the rest, vertices, texture sets
+_PMD_COUNT = struct.Struct("<I")
+
+
+def parse_pmd(data: bytes, name: str) -> Mesh:
+    """PMD, version 4, at rest; bones are left out.
+
+    The files wind most faces clockwise: each is turned to agree with the normals of its vertices.
+    """
+    if len(data) < _PMD_START.size:
+        raise ValueError(f"{name}: {len(data)} bytes are no PMD file, wanted a header of 20")
+    mark, version, _, count, sets = _PMD_START.unpack_from(data)
+    if mark != b"PSMD" or version != 4:
+        raise ValueError(f"{name}: starts with {mark!r} version {version}, wanted b'PSMD' 4")
+    row = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("rest", "V", 8 * sets + 20)])
+    end = _PMD_START.size + count * row.itemsize
+    if end + _PMD_COUNT.size > len(data):
+        raise ValueError(f"{name}: ends within its {count} vertices")
+    rows = np.frombuffer(data, row, count, _PMD_START.size)
+    (faces,) = _PMD_COUNT.unpack_from(data, end)
+    start = end + _PMD_COUNT.size
+    if start + 6 * faces > len(data):
+        raise ValueError(f"{name}: ends within its {faces} faces")
+    triangles = np.frombuffer(data, "<u2", 3 * faces, start).reshape(-1, 3).astype(np.int64)
+    if faces and triangles.max() >= count:
+        raise ValueError(f"{name}: a face names vertex {triangles.max()} of {count}")
+    vertices = rows["position"].astype(np.float64)
+    normals = rows["normal"].astype(np.float64)
+    return Mesh(vertices, _turned(vertices, triangles, normals), name)
+
+
+def _turned(
+    vertices: Float64[np.ndarray, "v 3"],
+    triangles: Int64[np.ndarray, "t 3"],
+    normals: Float64[np.ndarray, "v 3"],
+) -> Int64[np.ndarray, "t 3"]:
+    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+    wanted = normals[triangles].sum(axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers are sorted out later
+        inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), wanted) < 0
+    return np.where(inward[:, None], triangles[:, ::-1], triangles)
+
+
+def parse_ac3d(data: bytes, name: str) -> Mesh:
+    """AC3D: all polygons of all objects, placed by the tree. Lines, without area, are left out."""
+    text = data.decode("latin1")
+    if not text.startswith("AC3D"):
+        raise ValueError(f"{name}: starts with {text[:8]!r}, wanted 'AC3D'")
+    # Not `splitlines`, for which some letters of Latin-1 end a line.
+    reader = _Ac3d(text.replace("\r\n", "\n").removesuffix("\n").split("\n"), name)
+    reader.read_object(np.eye(4))
+    vertices = np.concatenate(reader.vertices) if reader.vertices else np.zeros((0, 3))
+    sizes = np.array([len(polygon) for polygon in reader.polygons], np.int64)
+    corners = np.array([corner for polygon in reader.polygons for corner in polygon], np.int64)
+    return Mesh(vertices, fan_triangles(corners, np.cumsum(sizes) - sizes, sizes), name)
+
+
+class _Ac3d:
+    """The lines of an AC3D file, read once from top to bottom."""
+
+    def __init__(self, lines: list[str], name: str):
+        self._lines, self._name = lines, name
+        self._at = 1  # behind the mark
+        self._seen = 0
+        self.vertices: list[np.ndarray] = []
+        self.polygons: list[list[int]] = []  # corners, numbered over all objects
+
+    def read_object(self, parent: Float64[np.ndarray, "4 4"]) -> None:
+        """The next OBJECT and, by recursion, its children; MATERIAL lines before it are skipped."""
+        # Exporters that drop an object forget to count one child less: the file ends instead.
+        if not any(self._lines[self._at :]):
+            return
+        while (words := self._words())[:1] != ["OBJECT"]:
+            if words[:1] != ["MATERIAL"] and words:
+                self._fail(f"wanted OBJECT or MATERIAL, got {words[0]!r}")
+        local = np.eye(4)
+        first = count = 0
+        while True:
+            match self._words():
+                case ["rot", *numbers] if len(numbers) == 9:
+                    # A row of the file is where an axis of the object goes.
+                    local[:3, :3] = self._floats(numbers).reshape(3, 3).T
+                case ["loc", *numbers] if len(numbers) == 3:
+                    local[:3, 3] = self._floats(numbers)
+                case ["data", length]:
+                    self._skip_text(self._count(length))
+                case ["numvert", number]:
+                    first, count = self._seen, self._count(number)
+                    points = [self._floats((self._words() + [""] * 3)[:3]) for _ in range(count)]
+                    self._place(np.array(points).reshape(-1, 3), parent @ local)
+                case ["numsurf", number]:
+                    for _ in range(self._count(number)):
+                        self._read_surface(first, count)
+                case ["kids", number]:
+                    for _ in range(self._count(number)):
+                        self.read_object(parent @ local)
+                    return
+                case ["OBJECT", *_]:
+                    self._fail("wanted 'kids' before the next OBJECT")
+                case _:  # name, texture, crease, ...: of no concern to the shape
+                    pass
+
+    def _place(self, points: np.ndarray, motion: Float64[np.ndarray, "4 4"]) -> None:
+        self.vertices.append(points @ motion[:3, :3].T + motion[:3, 3])
+        self._seen += len(points)
+
+    def _read_surface(self, first: int, count: int) -> None:
+        kind = 0
+        while True:
+            match self._words():
+                case ["SURF", flags]:
+                    kind = self._count(flags, base=0) & 0xF
+                case ["mat", _]:
+                    pass
+                case ["refs", number]:
+                    corners = [
+                        self._count((self._words() or [""])[0]) for _ in range(self._count(number))
+                    ]
+                    break
+                case words:
+                    self._fail(f"wanted SURF, mat or refs, got {' '.join(words)!r}")
+        if any(corner >= count for corner in corners):
+            self._fail(f"a surface names vertex {max(corners)} of {count}")
+        if kind == 0:
+            self.polygons.append([first + corner for corner in corners])
+
+    def _skip_text(self, length: int) -> None:
+        """Free text of `length` characters, which may hold ends of lines."""
+        while True:
+            length -= len(self._line()) + 1
+            if length < 0:
+                return
+
+    def _line(self) -> str:
+        if self._at >= len(self._lines):
+            raise ValueError(f"{self._name}: ends too early, in line {self._at}")
+        self._at += 1
+        return self._lines[self._at - 1]
+
+    def _words(self) -> list[str]:
+        return self._line().split()
+
+    def _floats(self, words: list[str]) -> Float64[np.ndarray, " n"]:
+        try:
+            return np.array([float(word) for word in words])
+        except ValueError:
+            self._fail(f"wanted {len(words)} numbers, got {' '.join(words)!r}")
+            raise  # never reached
+
+    def _count(self, word: str, base: int = 10) -> int:
+        try:
+            number = int(word, base)
+        except ValueError:
+            number = -1
+        if number < 0:
+            self._fail(f"wanted a count or an index, got {word!r}")
+        return number
+
+    def _fail(self, message: str) -> None:
+        raise ValueError(f"{self._name}: line {self._at}: {message}")
+
+
+def _whole(parse: Callable[[bytes, str], object]) -> Callable[[bytes, str, Path], object]:
+    return lambda data, name, folder: parse(data, name)
+
+
+_PARSERS: dict[str, Callable[[bytes, str, Path], object]] = {
+    ".off": _whole(surfaces.parse_off),
+    ".obj": _whole(surfaces.parse_obj),
+    ".stl": _whole(surfaces.parse_stl),
+    ".ply": _whole(ply.parse),
+    ".glb": gltf.parse_glb,
+    ".gltf": gltf.parse_gltf,
+    ".pmd": _whole(parse_pmd),
+    ".ac": _whole(parse_ac3d),
+}
+SUFFIXES = tuple(_PARSERS)
+
+
+def read_mesh(path: Path) -> Mesh:
+    """The triangles of a file, its format told by the suffix (one of `SUFFIXES`).
+
+    Raises ValueError where the file cannot be read, or holds points and no faces.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in _PARSERS:
+        raise ValueError(f"{path}: unknown suffix {suffix!r}, wanted one of {' '.join(SUFFIXES)}")
+    try:
+        mesh = _PARSERS[suffix](path.read_bytes(), path.name, path.parent)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    if not isinstance(mesh, Mesh):
+        raise ValueError(f"{path}: is a point cloud, wanted a mesh with faces")
+    return mesh

@@ -1,0 +1,43 @@
+"""Our clouds as Open3D's, with what the classical methods need besides points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cfr_jax.data.scans import estimate_normals
+from cfr_jax.io import PointCloud
+from cfr_jax.runtime.optional import require
+
+
+def open3d_cloud(
+    cloud: PointCloud, normal_radius: float | None = None, voxel: float | None = None
+) -> Any:
+    """An `open3d.geometry.PointCloud`, thinned to `voxel` if that is given.
+
+    With a `normal_radius` it has normals: its own, or else estimated before the thinning from at
+    most 30 points within the radius, facing the centroid, so that two views agree on the sign.
+    """
+    o3d = require("open3d")
+    made = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))
+    if normal_radius is not None:
+        normals = cloud.normals
+        if normals is None:
+            center = cloud.points.mean(axis=0)
+            normals = estimate_normals(cloud.points, normal_radius, viewpoint=tuple(center))
+        made.normals = o3d.utility.Vector3dVector(normals)
+    if voxel is None:
+        return made
+    thinned = made.voxel_down_sample(voxel)
+    if thinned.has_normals():
+        thinned.normalize_normals()
+    return thinned
+
+
+def described(
+    cloud: PointCloud, normal_radius: float, feature_radius: float, voxel: float | None
+) -> tuple[Any, Any]:
+    """A cloud and its fast point feature histograms (FPFH; Rusu et al., 2009)."""
+    o3d = require("open3d")
+    made = open3d_cloud(cloud, normal_radius, voxel)
+    around = o3d.geometry.KDTreeSearchParamHybrid(radius=feature_radius, max_nn=100)
+    return made, o3d.pipelines.registration.compute_fpfh_feature(made, around)

@@ -1,0 +1,60 @@
+"""Our own refinement (`cfr_jax.refine.generalized_icp`) without the network before it."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cfr_jax.data.scans import estimate_normals
+from cfr_jax.evaluation.baselines.start import Start, initial
+from cfr_jax.io import PointCloud
+from cfr_jax.refine import generalized_icp
+
+
+def register(
+    source: PointCloud,
+    target: PointCloud,
+    *,
+    cut: float,
+    normal_radius: float,
+    start: Start = "centroid",
+) -> Float[np.ndarray, "4 4"]:
+    """Generalized ICP whose robust cut shrinks over 4, 2 and 1 times `cut`.
+
+    The clouds are brought to the size at which that is the refinement's usual last cut. Normals
+    are estimated where they are missing.
+    """
+    motion = initial(source, target, start)
+    center, scale = target.points.mean(axis=0), cut / generalized_icp.CUT
+    moved = source.points @ motion[:3, :3].T + motion[:3, 3]
+    found = _refine(
+        *(jnp.asarray((points - center) / scale, jnp.float32) for points in (moved, target.points)),
+        *(jnp.asarray(_normals(cloud, normal_radius), jnp.float32) for cloud in (source, target)),
+    )
+    unit = np.asarray(found, np.float64)
+    # x = center + scale * u on both sides
+    answer = unit.copy()
+    answer[:3, 3] = center + scale * unit[:3, 3] - unit[:3, :3] @ center
+    return answer @ motion
+
+
+@jax.jit
+def _refine(
+    source: Float[Array, "n 3"],
+    target: Float[Array, "m 3"],
+    source_normals: Float[Array, "n 3"],
+    target_normals: Float[Array, "m 3"],
+) -> Float[Array, "4 4"]:
+    surfaces = (
+        generalized_icp.Surface(points, normals, jnp.ones(len(points), bool))
+        for points, normals in ((source, source_normals), (target, target_normals))
+    )
+    return generalized_icp.refine(*surfaces, jnp.eye(4)).transform
+
+
+def _normals(cloud: PointCloud, radius: float) -> Float[np.ndarray, "n 3"]:
+    if cloud.normals is not None:
+        return cloud.normals
+    return estimate_normals(cloud.points, radius)

@@ -1,0 +1,210 @@
+"""The table in Markdown. What depends on the machine and the day stands apart from the errors."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from cfr_jax.evaluation.measuring import Measured, recall_name
+from cfr_jax.evaluation.metrics import Statistic
+
+Numbers = Mapping[str, Statistic | None]
+_NONE = "–"
+
+
+def write_table(
+    measured: Sequence[Measured],
+    numbers: Mapping[str, Numbers],
+    about: Mapping[str, Any],
+    missing: Mapping[str, str],
+    apart: Sequence[Measured] = (),
+    numbers_apart: Mapping[str, Numbers] | None = None,
+) -> str:
+    """All of it: errors, their intervals, times, failures, settings.
+
+    `about` is what `running` knows of data and machine; `missing` tells why a method was left out;
+    `apart` and `numbers_apart` are the same without the pairs of nearly symmetric shapes. Same
+    answers, same text, but for the section `Time`.
+    """
+    unit = about["unit"]
+    lengths = unit or "the unit of the clouds"
+    columns = _columns(about["thresholds"], unit, any(m.chamfer is not None for m in measured))
+    lines = [
+        f"# {about['title']}",
+        "",
+        f"{about['pairs']} pairs of `{about['data']}`, seed {about['seed']}. RE in degrees, TE in "
+        f"{lengths}. Errors are over the pairs that a method answered; recall is over all pairs, "
+        "and a failure is a miss.",
+        "",
+        *_errors(measured, numbers, columns),
+        "",
+        *_apart(apart, numbers_apart or {}, columns, about),
+        "## Settings",
+        "",
+        *(f"- **{m.name}**: {_settings(m.about)}" for m in measured),
+        *(f"- **{name}**: not run, {reason}" for name, reason in missing.items()),
+        "",
+        *_failures(measured),
+        "## Time",
+        "",
+        f"{about['machine']}; table of {about['date']}, commit {about['commit']}, answers of the "
+        "commits beside them. Median of the pairs: from "
+        "clouds in host memory to the motion in host memory, device-synchronized, neighbors, "
+        "normals and features included. Imports, compilation and first-call costs are apart. "
+        f"Versions: {', '.join(f'{k} {v}' for k, v in about['versions'].items())}.",
+        "",
+        *_grid(
+            ["method", "ms / pair", "start-up s", "threads", "device", "pairs a call", "commit"],
+            [_times(m) for m in measured],
+        ),
+        "",
+        *_modules(measured),
+        f"    {about['command']}",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _errors(
+    measured: Sequence[Measured],
+    numbers: Mapping[str, Numbers],
+    columns: Sequence[tuple[str, str, float, str]],
+) -> list[str]:
+    """A row for each method, and once more with the intervals."""
+    header = ["method", *(title for title, *_ in columns)]
+    values, intervals = (
+        [
+            [m.name, *(tell(numbers[m.name][k], s, form) for _, k, s, form in columns)]
+            for m in measured
+        ]
+        for tell in (_value, _interval)
+    )
+    failed = [str(len(m.failures)) for m in measured]
+    return [
+        *_grid([*header, "failed"], [[*row, n] for row, n in zip(values, failed, strict=True)]),
+        "",
+        "95 % intervals (bootstrap over pairs):",
+        "",
+        *_grid(header, intervals),
+    ]
+
+
+def _apart(
+    measured: Sequence[Measured],
+    numbers: Mapping[str, Numbers],
+    columns: Sequence[tuple[str, str, float, str]],
+    about: Mapping[str, Any],
+) -> list[str]:
+    if not measured:
+        return []
+    return [
+        "## Without nearly symmetric shapes",
+        "",
+        f"{about['nearly_symmetric']} of the pairs are of shapes that some rotation lays on "
+        "themselves about as closely as sampling can tell (`cfr_jax/evaluation/symmetry.py`, a "
+        "rule on the shape alone); the others:",
+        "",
+        *_errors(measured, numbers, columns),
+        "",
+    ]
+
+
+def _modules(measured: Sequence[Measured]) -> list[str]:
+    """Milliseconds of the parts of a network, where they were timed."""
+    timed = {m.name: m.modules for m in measured if m.modules}
+    if not timed:
+        return []
+    parts = list(dict.fromkeys(part for seconds in timed.values() for part in seconds))
+    rows = [
+        [
+            name,
+            *(f"{seconds[part] * 1e3:.2f}" if part in seconds else _NONE for part in parts),
+            f"{sum(seconds.values()) * 1e3:.1f}",
+        ]
+        for name, seconds in timed.items()
+    ]
+    return [
+        "Milliseconds a pair by module, each compiled alone, device-synchronized, on the threads "
+        "above; medians of a few pairs:",
+        "",
+        *_grid(["method", *parts, "sum"], rows),
+        "",
+    ]
+
+
+def _columns(
+    thresholds: Sequence[tuple[float, float]], unit: str, chamfer: bool
+) -> list[tuple[str, str, float, str]]:
+    """Title, key, scale, format."""
+    columns = [
+        ("RE mean", "err_r_mean", 1.0, ".2f"),
+        ("RE median", "err_r_median", 1.0, ".2f"),
+        ("TE mean", "err_t_mean", 1.0, ".4f"),
+        ("TE median", "err_t_median", 1.0, ".4f"),
+    ]
+    if chamfer:
+        columns += [
+            ("CD mean ×1000", "chamfer_mean", 1e3, ".3f"),
+            ("CD median ×1000", "chamfer_median", 1e3, ".3f"),
+        ]
+    for angle, distance in thresholds:
+        title = f"recall {angle:g}°, {distance:g}{' ' + unit if unit else ''}"
+        columns.append((title, recall_name(angle, distance), 1.0, ".3f"))
+    return columns
+
+
+def _value(number: Statistic | None, scale: float, form: str) -> str:
+    return _NONE if number is None else format(number.value * scale, form)
+
+
+def _interval(number: Statistic | None, scale: float, form: str) -> str:
+    if number is None:
+        return _NONE
+    return f"{number.low * scale:{form}} to {number.high * scale:{form}}"
+
+
+def _settings(about: Mapping[str, Any]) -> str:
+    told = [about["use"]]
+    told += [f"{key} {json.dumps(value)}" for key, value in about["options"].items()]
+    if about["estimated_normals"]:
+        told.append("normals estimated from the points")
+    if "weights" in about:
+        told.append(f"weights {about['weights']} ({about['sha256'][:12]})")
+    return ", ".join(told)
+
+
+def _failures(measured: Sequence[Measured]) -> list[str]:
+    failing = [m for m in measured if m.failures]
+    if not failing:
+        return []
+    lines = ["## Failures", ""]
+    for m in failing:
+        reasons: dict[str, list[int]] = {}
+        for index, reason in m.failures.items():
+            reasons.setdefault(reason, []).append(index)
+        for reason, rows in reasons.items():
+            shown = ", ".join(map(str, rows[:10])) + (", …" if len(rows) > 10 else "")
+            lines.append(f"- **{m.name}**, {len(rows)} pairs ({shown}): {reason}")
+    return [*lines, ""]
+
+
+def _times(m: Measured) -> list[str]:
+    started = m.started or {}
+    time = m.milliseconds()
+    return [
+        m.name,
+        _NONE if np.isnan(time) else f"{time:.1f}",
+        f"{started['seconds']:.1f}" if started else _NONE,
+        str(started.get("threads", _NONE)),
+        str(started.get("device", _NONE)),
+        str(m.about["batch"]),
+        str(started.get("commit", _NONE)),
+    ]
+
+
+def _grid(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    ruler = ["---"] + ["---:"] * (len(header) - 1)
+    return ["| " + " | ".join(cells) + " |" for cells in (header, ruler, *rows)]

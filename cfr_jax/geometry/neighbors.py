@@ -1,0 +1,209 @@
+"""The K nearest points of each point: exact, self dropped by index, far ones replaced.
+
+Two ways to the same sets. `nearest` is pure JAX for any device; `nearest_on_host` is for clouds
+that are still in host memory. Only the *set* of a point's neighbors matters to the network, so
+neither sorts; both break ties by the lower index. (Distances that agree to the last bit or two of
+float32 may fall on either side of the K-th place.) Everything downstream takes indices.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int32
+
+from cfr_jax.geometry.selection import k_smallest, nth_set_bit, pack
+
+_BLOCK = 1 << 16  # distances held at a time: they stay in a core's cache
+# On the host: up to so many points comparing all beats the tree (5 to 13 ms at 1,024 points,
+# 25 to 31 at 2,048), a block of rows at a time.
+_FEW = 1536
+_HOST_ROWS = 64
+_TREE_ROWS = 1 << 13
+
+
+def nearest(
+    points: Float[Array, "n 3"],
+    k: int,
+    *,
+    radius: float | None = None,
+    mask: Bool[Array, " n"] | None = None,
+) -> Int32[Array, "n k"]:
+    """Indices of the `k` nearest other points of each point.
+
+    A neighbor further than `radius` is replaced by the nearest one, which is kept even when it lies
+    outside. Points where `mask` is false are nobody's neighbor; a cloud with fewer than k + 1 valid
+    points repeats its nearest ones in the same way. Needs 1 <= k <= n - 1. Not differentiable
+    (indices). Memory grows with n, not with n^2: rows are done in blocks.
+    """
+    n = points.shape[0]
+    if not 1 <= k <= n - 1:
+        raise ValueError(
+            f"k: got {k} neighbors for a cloud of {n} points, wanted 1 <= k <= {n - 1}"
+        )
+    points = points.astype(jnp.float32)  # as the host measures; the search works on its bits
+    limit = jnp.inf if radius is None else radius * radius
+
+    def choose(row, square):
+        if mask is not None:
+            square = jnp.where(mask, square, jnp.inf)
+        square = jnp.where(row == jnp.arange(n), jnp.inf, square)
+        first = jnp.argmin(square, axis=1).astype(jnp.int32)
+        chosen = k_smallest(square, k)
+        far = ~(jnp.take_along_axis(square, chosen, axis=1) <= limit)
+        far |= jnp.isinf(jnp.take_along_axis(square, chosen, axis=1))
+        return jnp.where(far, first[:, None], chosen)
+
+    return _by_rows(points, choose)
+
+
+def first_in_ball(
+    points: Float[Array, "n 3"], k: int, radius: float, mask: Bool[Array, " n"] | None = None
+) -> Int32[Array, "n k"]:
+    """The first `k` other valid points, by index, within `radius` of each; what is missing, itself.
+
+    RPM-Net's neighborhoods: not the nearest, and with repeated centers where a ball is sparse. A
+    rigid motion does not change them.
+    """
+
+    def choose(row, square):
+        inside = (square <= radius * radius) & (row != jnp.arange(points.shape[0]))
+        if mask is not None:
+            inside &= mask
+        rank = jnp.arange(k, dtype=jnp.int32)[None, :]
+        found = nth_set_bit(pack(inside), jnp.broadcast_to(rank, (len(row), k)))
+        return jnp.where(rank < jnp.sum(inside, axis=1, keepdims=True), found, row)
+
+    return _by_rows(points, choose)
+
+
+def _by_rows(points, choose):
+    """`choose(row, square)` for blocks of rows: their numbers (r, 1) and their squared distances to
+    all points (r, n) in, their neighbors (r, k) out; all rows (n, k) back."""
+    n = points.shape[0]
+    rows = max(1, min(n, _BLOCK // n))
+    blocks = -(-n // rows)
+    queries = jnp.pad(points, ((0, blocks * rows - n), (0, 0)))
+
+    def block(start):
+        here = lax.dynamic_slice_in_dim(queries, start, rows)
+        # by differences: |a|^2 - 2ab + |b|^2 cancels to nothing for close points far from the
+        # origin
+        square = sum((here[:, axis, None] - points[None, :, axis]) ** 2 for axis in range(3))
+        return choose((start + jnp.arange(rows, dtype=jnp.int32))[:, None], square)
+
+    found = lax.map(block, rows * jnp.arange(blocks, dtype=jnp.int32))
+    return found.reshape(blocks * rows, -1)[:n]
+
+
+class Closest(NamedTuple):
+    """For each query the closest point of a cloud, and its squared distance."""
+
+    index: Int32[Array, " n"]
+    square: Float[Array, " n"]
+
+
+def closest(
+    queries: Float[Array, "n 3"],
+    points: Float[Array, "m 3"],
+    mask: Bool[Array, " m"] | None = None,
+) -> Closest:
+    """The closest valid point to each query, by comparing all; for clouds centered near zero.
+
+    |y|^2 - 2 x y ranks the points with one matrix product. Its cancellation can only confuse points
+    that lie within float32's rounding of each other; the distance is then taken by differences.
+    """
+    norms = jnp.sum(points * points, axis=1)
+    if mask is not None:
+        norms = jnp.where(mask, norms, jnp.inf)
+    m = points.shape[0]
+    rows = max(1, min(queries.shape[0], _BLOCK * 16 // m))
+    blocks = -(-queries.shape[0] // rows)
+    padded = jnp.pad(queries, ((0, blocks * rows - queries.shape[0]), (0, 0)))
+
+    def block(here):
+        rank = norms - 2 * jnp.matmul(here, points.T, precision=lax.Precision.HIGHEST)
+        # two plain reductions: XLA's argmin on CPU is not vectorized
+        best = jnp.min(rank, axis=1, keepdims=True)
+        return jnp.min(jnp.where(rank <= best, jnp.arange(m, dtype=jnp.int32), m - 1), axis=1)
+
+    index = lax.map(block, padded.reshape(blocks, rows, 3)).reshape(-1)[: queries.shape[0]]
+    offset = queries - points[index]
+    return Closest(index, jnp.sum(offset * offset, axis=1))
+
+
+def nearest_on_host(
+    points: np.ndarray, k: int, *, radius: float | None = None, workers: int = 1
+) -> np.ndarray:
+    """`nearest` for an (n, 3) cloud in host memory; (n, k) int32.
+
+    Up to a thousand points or so it compares all of them, beyond that it asks a KD-tree, with
+    `workers` threads. The tree measures in float64, the network in float32: a few more neighbors
+    than wanted are asked for and measured again in float32, so that ties fall as they do on the
+    device. (Only where more than a few hundred points tie does the tree choose among them.)
+    """
+    points = np.asarray(points, np.float32)
+    n = len(points)
+    if not 1 <= k <= n - 1:
+        raise ValueError(
+            f"k: got {k} neighbors for a cloud of {n} points, wanted 1 <= k <= {n - 1}"
+        )
+    keys = _among_all(points, k) if n <= _FEW else _in_tree(points, k, workers)
+    found = (keys & 0xFFFFFFFF).astype(np.int32)
+    if radius is not None:
+        nearest_one = (keys.min(axis=1) & 0xFFFFFFFF).astype(np.int32)
+        inside = _square_of(keys) <= np.float32(radius) ** 2
+        found = np.where(inside, found, nearest_one[:, None])
+    return found
+
+
+def _among_all(points, k):
+    """Keys of the k nearest other points of each point, by comparing all."""
+    n = len(points)
+    columns, index = np.ascontiguousarray(points.T), np.arange(n)
+    blocks = []
+    for rows in np.array_split(index, -(-n // _HOST_ROWS)):
+        square = sum((axis[rows, None] - axis) ** 2 for axis in columns)
+        square[np.arange(len(rows)), rows] = np.inf
+        blocks.append(_smallest(square, index, k))
+    return np.concatenate(blocks)
+
+
+def _in_tree(points, k, workers):
+    """The same by a KD-tree, some rows at a time: what it finds is many times what is kept."""
+    n = len(points)
+    # imported here: a fifth of a second that small clouds need not wait for
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points)
+    keys = np.empty((n, k), np.int64)
+    for rows in np.array_split(np.arange(n), -(-n // _TREE_ROWS)):
+        for more in (8, 256):  # on a lattice the few are not enough
+            wide = min(n, k + more)
+            near = tree.query(points[rows], wide, workers=workers)[1].reshape(len(rows), wide)
+            offset = points[near] - points[rows, None]
+            square = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
+            farthest = square.max(axis=1)
+            square[near == rows[:, None]] = np.inf
+            keys[rows] = _smallest(square, near, k)
+            last = _square_of(keys[rows]).max(axis=1)
+            rows = rows[last == farthest] if wide < n else rows[:0]
+    return keys
+
+
+def _smallest(square, index, k):
+    """Keys of each row's k smallest distances, in no order.
+
+    A key is the distance's bits, monotonic as none is negative, above the point's index: ties fall
+    to the lower index, and numpy partitions whole numbers by vector instructions.
+    """
+    keys = square.view(np.int32).astype(np.int64) << 32 | index
+    keys.partition(k - 1, axis=1)
+    return keys[:, :k].copy()
+
+
+def _square_of(keys):
+    return (keys >> 32).astype(np.int32).view(np.float32)

@@ -1,0 +1,207 @@
+"""From a user's clouds to the network's, and back: frame, scale, budget, normals, padding.
+
+Host side, float64: at map coordinates (5e6 m) float32 resolves half a meter, so everything that
+involves the caller's frame happens here, and the device sees centered clouds of unit size only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from cfr_jax.geometry.neighbors import nearest_on_host
+from cfr_jax.io import PointCloud
+
+# Sizes that clouds are padded to, so that a new cloud rarely means a new compilation. Steps of a
+# third waste little; a cloud below the smallest is compiled as it is.
+_BUCKETS = tuple(
+    size
+    for power in range(7, 21)
+    for size in (2**power, 2**power * 4 // 3 // 32 * 32, 2**power * 5 // 3 // 32 * 32)
+)
+_OUTER = 0.995  # this share of the points lies in the unit sphere; stray ones may lie outside
+_STRAY = 4.0  # points so far out are errors of the sensor, and would drown the network
+FARTHEST = 1e3  # radii between the clouds: float32 holds that with digits to spare
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Where the unit-size clouds lie in the caller's coordinates: x = center + scale * unit."""
+
+    source_center: Float[np.ndarray, " 3"]
+    target_center: Float[np.ndarray, " 3"]
+    scale: float
+    initial: Float[np.ndarray, "4 4"]
+    """Moves the caller's source before it is centered."""
+    size_ratio: float = 1.0
+    """Radius of the source over that of the target."""
+
+    def to_caller(self, transforms: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
+        """Motions between the unit clouds as motions of the caller's source onto the target."""
+        transforms = np.asarray(transforms, np.float64)
+        rotation = _orthonormal(transforms[..., :3, :3])
+        moved = np.broadcast_to(np.eye(4), transforms.shape).copy()
+        moved[..., :3, :3] = rotation
+        # rotate about the source's center, so that large coordinates never multiply float32's error
+        moved[..., :3, 3] = (
+            self.target_center + self.scale * transforms[..., :3, 3] - rotation @ self.source_center
+        )
+        return moved @ self.initial
+
+    def to_unit(self, motions: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
+        """The other way: motions of the caller's source as motions between the unit clouds."""
+        motions = np.asarray(motions, np.float64) @ np.linalg.inv(self.initial)
+        unit = motions.copy()
+        unit[..., :3, :3] = _orthonormal(motions[..., :3, :3])
+        place = motions[..., :3, :3] @ self.source_center + motions[..., :3, 3]
+        unit[..., :3, 3] = (place - self.target_center) / self.scale
+        return unit
+
+
+@dataclass(frozen=True)
+class UnitCloud:
+    """A cloud ready for the device: unit size, within budget, padded to a bucket."""
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"] | None
+    neighbors: Int[np.ndarray, "n k"]
+    mask: Bool[np.ndarray, " n"]
+    rows: Int[np.ndarray, " used"]
+    """Which of the caller's points these are, in order; the padding follows them."""
+
+
+def unit_frames(
+    source: PointCloud, target: PointCloud, initial: Float[np.ndarray, "4 4"] | None
+) -> Frames:
+    """Centers and a common scale that bring both clouds into the unit sphere.
+
+    Without an initial motion each cloud is centered at its own centroid: any offset between them is
+    taken out. With one, both keep their places relative to the target's centroid. Raises ValueError
+    for clouds without extent, and for an initial motion that leaves them far apart.
+    """
+    (source_center, source_radius), (target_center, target_radius) = (
+        _ball(name, cloud.points) for name, cloud in (("source", source), ("target", target))
+    )
+    scale, ratio = max(source_radius, target_radius), source_radius / target_radius
+    if initial is None:
+        return Frames(source_center, target_center, scale, np.eye(4), ratio)
+    place = initial[:3, :3] @ source_center + initial[:3, 3]
+    away = float(np.abs(place - target_center).max())
+    if not away <= FARTHEST * scale:
+        raise ValueError(
+            f"initial: leaves the source {away:.3g} away from the target, wanted at most "
+            f"{FARTHEST * scale:.3g}, which is {FARTHEST:g} times the radius of the clouds"
+        )
+    # What is off by rounding is made a rotation, about the source's center: far from the origin
+    # the slightest turn about that would move the cloud.
+    exact = np.eye(4)
+    exact[:3, :3] = _orthonormal(initial[:3, :3])
+    exact[:3, 3] = place - exact[:3, :3] @ source_center
+    return Frames(target_center, target_center, scale, exact, ratio)
+
+
+def to_unit(
+    cloud: PointCloud,
+    center: Float[np.ndarray, " 3"],
+    scale: float,
+    motion: Float[np.ndarray, "4 4"],
+    *,
+    budget: int,
+    neighbors: int,
+    radius: float,
+    seed: int,
+) -> UnitCloud:
+    """At most `budget` points of `cloud`, moved, centered, scaled; with neighbors and padding.
+
+    Stray points, more than four radii out, are left out.
+    """
+    points = (cloud.points @ motion[:3, :3].T + motion[:3, 3] - center) / scale
+    near = np.linalg.norm(points - np.median(points, axis=0), axis=1) <= _STRAY
+    rows = np.flatnonzero(near)
+    rows = rows[subsample(points[rows], budget, seed)]
+    used = points[rows].astype(np.float32)
+    count = len(used)
+    size = bucket(count) if count > neighbors else count
+    found = nearest_on_host(used, min(neighbors, count - 1), radius=radius)
+    pad = ((0, size - count), (0, 0))
+    normals = None
+    if cloud.normals is not None:
+        normals = (cloud.normals[rows] @ motion[:3, :3].T).astype(np.float32)
+        normals = np.pad(normals, pad)
+    return UnitCloud(np.pad(used, pad), normals, np.pad(found, pad), np.arange(size) < count, rows)
+
+
+def thinned(unit: UnitCloud, *, budget: int, neighbors: int, radius: float, seed: int) -> UnitCloud:
+    """At most `budget` points of a unit cloud, where they lie; its `rows` are those of `unit`."""
+    normals = None if unit.normals is None else unit.normals[unit.mask].astype(np.float64)
+    cloud = PointCloud(unit.points[unit.mask].astype(np.float64), normals)
+    options = {"budget": budget, "neighbors": neighbors, "radius": radius, "seed": seed}
+    return to_unit(cloud, np.zeros(3), 1.0, np.eye(4), **options)
+
+
+def subsample(points: Float[np.ndarray, "n 3"], budget: int, seed: int) -> Int[np.ndarray, " m"]:
+    """Rows of at most `budget` points, evenly spread: one at random of each voxel of a grid.
+
+    The grid is the coarsest of a bisection that fills no fewer voxels than wanted; what is too many
+    is dropped at random. Where the points lie in fewer places than that, all are drawn at random.
+    The same seed gives the same rows.
+    """
+    n = len(points)
+    if n <= budget:
+        return np.arange(n)
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(n)[: 32 * budget]  # enough to find the voxels; bounds the time
+    shuffled = points[order] - np.median(points[order], axis=0)
+    # stray points would stretch the grid: they share its outermost voxels
+    reach = float(np.quantile(np.abs(shuffled).max(axis=1), _OUTER))
+    reach = max(reach, np.finfo(np.float64).tiny)
+    shuffled = np.clip(shuffled, -reach, reach)
+    low, high = 0.0, 2.0 * reach
+    chosen = np.arange(len(order))
+    for _ in range(12):
+        voxel = (low + high) / 2
+        first = _first_of_each_voxel(shuffled, voxel)
+        if len(first) >= budget:
+            low, chosen = voxel, first
+        else:
+            high = voxel
+    return np.sort(order[rng.permutation(chosen)[:budget]])
+
+
+def bucket(count: int) -> int:
+    """The size that a cloud of `count` points is padded to."""
+    return next((size for size in _BUCKETS if size >= count), count)
+
+
+def _ball(name, points):
+    """Center and radius of all but the stray points; far ones would pull a plain mean away."""
+    center = points.mean(axis=0)
+    away = np.linalg.norm(points - center, axis=1)
+    center = points[away <= np.quantile(away, _OUTER, method="higher")].mean(axis=0)
+    radius = float(np.quantile(np.linalg.norm(points - center, axis=1), _OUTER))
+    if not radius > 1e-9 * np.abs(points).max():
+        raise ValueError(
+            f"{name}: all of its {len(points)} points lie in one place, "
+            "wanted a cloud with some extent"
+        )
+    return center, radius
+
+
+def _first_of_each_voxel(points, voxel):
+    # the middle of a voxel lies at zero, as coordinates of flat and symmetric clouds often do:
+    # a border there would let rounding decide
+    cells = np.floor(points / voxel + 0.5).astype(np.int64)
+    cells -= cells.min(axis=0)
+    extent = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+    return np.unique(keys, return_index=True)[1]
+
+
+def _orthonormal(rotations):
+    """The closest proper rotations: float32's 1e-7 would show at a million meters."""
+    u, _, vt = np.linalg.svd(rotations)
+    sign = np.linalg.det(u @ vt)
+    u[..., :, 2] *= sign[..., None]
+    return u @ vt

@@ -1,0 +1,236 @@
+"""glTF 2.0, as one file (GLB) or as JSON with its buffers beside or within it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import unquote
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from cfr_jax.io.cloud import CloudFileError, as_float64
+from cfr_jax.io.mesh import Mesh
+
+T = TypeVar("T")
+
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3}
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+# A mesh may be placed many times; this bounds the rows that a small file can unfold to.
+_ALWAYS_ALLOWED_ROWS = 1 << 19
+_MOST_ROWS_PER_BYTE = 1
+_ROWS_PER_PRIMITIVE = 64  # what even an empty one takes, in time
+
+
+def parse_glb(data: bytes, name: str, folder: Path) -> Mesh:
+    """The triangles of the scene, each mesh placed as its nodes say; meters, y up, as in glTF."""
+    if data[:4] != b"glTF" or len(data) < 20:
+        raise CloudFileError(f"byte 0: starts with {data[:4]!r}, wanted b'glTF' and a header")
+    version, length = struct.unpack_from("<II", data, 4)
+    if version != 2 or length > len(data):
+        raise CloudFileError(
+            f"byte 4: version {version}, {length} bytes; wanted version 2 and at most {len(data)}"
+        )
+    chunks: dict[int, bytes] = {}
+    position = 12
+    while position + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, position)
+        position += 8
+        if position + size > length:
+            raise CloudFileError(
+                f"byte {position - 8}: a chunk of {size} bytes ends behind the file"
+            )
+        chunks.setdefault(kind, data[position : position + size])
+        position += size
+    if _JSON_CHUNK not in chunks:
+        raise CloudFileError("byte 12: wanted a chunk of JSON, found none")
+    return _Scene(chunks[_JSON_CHUNK], chunks.get(_BINARY_CHUNK), folder).mesh(name)
+
+
+def parse_gltf(data: bytes, name: str, folder: Path) -> Mesh:
+    """As `parse_glb`; buffers are read from the file's own folder only."""
+    return _Scene(data, None, folder).mesh(name)
+
+
+class _Scene:
+    """The parts of a glTF document that say where triangles are."""
+
+    def __init__(self, text: bytes, binary: bytes | None, folder: Path) -> None:
+        try:
+            self.document = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise CloudFileError(f"the JSON is damaged: {error}") from None
+        if not isinstance(self.document, dict):
+            raise CloudFileError("wanted a JSON object")
+        self.folder = folder
+        self.buffers: dict[int, bytes] = {} if binary is None else {0: binary}
+        self.room = _ALWAYS_ALLOWED_ROWS + _MOST_ROWS_PER_BYTE * (len(text) + len(binary or b""))
+        needed = _get(self.document, "extensionsRequired", list, [])
+        packed = [name for name in needed if "compression" in str(name)]
+        if packed:
+            raise CloudFileError(f"needs the extension {packed[0]!r}, wanted an uncompressed mesh")
+
+    def mesh(self, name: str) -> Mesh:
+        """All triangles, in the frame of the scene."""
+        vertices: list[np.ndarray] = [np.empty((0, 3))]
+        triangles: list[np.ndarray] = [np.empty((0, 3), np.int64)]
+        count = 0
+        for index, placement in self._placed_meshes():
+            for primitive in _get(self._item("meshes", index), "primitives", list):
+                points, faces = self._primitive(primitive)
+                self.room -= len(points) + len(faces) + _ROWS_PER_PRIMITIVE
+                if self.room < 0:
+                    raise CloudFileError("unfolds, by meshes placed again, to more than we read")
+                with np.errstate(all="ignore"):  # what is not finite is refused later on
+                    vertices.append(points @ placement[:3, :3].T + placement[:3, 3])
+                triangles.append(faces + count)
+                count += len(points)
+        return Mesh(np.concatenate(vertices), np.concatenate(triangles), name)
+
+    def _placed_meshes(self) -> list[tuple[int, Float64[np.ndarray, "4 4"]]]:
+        """Each mesh of the scene with the transform of its frame into the scene's."""
+        nodes = _get(self.document, "nodes", list, [])
+        scenes = _get(self.document, "scenes", list, [])
+        if scenes:
+            scene = self._item("scenes", _get(self.document, "scene", int, 0))
+            roots = _get(scene, "nodes", list, [])
+        else:
+            children = (c for node in nodes for c in _get(node, "children", list, []))
+            below = {child for child in children if type(child) is int}
+            roots = [index for index in range(len(nodes)) if index not in below]
+        placed = []
+        visited: set[int] = set()
+        todo = [(root, np.eye(4)) for root in reversed(roots)]
+        while todo:
+            index, above = todo.pop()
+            node = self._item("nodes", index)
+            if index in visited:  # nodes are trees: without this a cycle would not end
+                raise CloudFileError(f"node {index} hangs below two nodes, wanted a tree")
+            visited.add(index)
+            with np.errstate(all="ignore"):
+                placement = above @ _placement(node)
+            if "mesh" in node:
+                placed.append((_get(node, "mesh", int), placement))
+            todo += [(child, placement) for child in reversed(_get(node, "children", list, []))]
+        return placed
+
+    def _primitive(self, primitive: Any) -> tuple[np.ndarray, Int64[np.ndarray, "t 3"]]:
+        mode = _get(primitive, "mode", int, _TRIANGLES)
+        if mode not in (_TRIANGLES, _STRIP, _FAN):  # points and lines have no surface
+            return np.empty((0, 3)), np.empty((0, 3), np.int64)
+        attributes = _get(primitive, "attributes", dict)
+        points = as_float64(self._accessor(_get(attributes, "POSITION", int), "VEC3"))
+        corners = np.arange(len(points))
+        if "indices" in primitive:
+            corners = self._accessor(_get(primitive, "indices", int), "SCALAR")[:, 0]
+            if corners.dtype.kind == "f":
+                raise CloudFileError("the indices of a primitive are floats, wanted integers")
+            corners = corners.astype(np.int64)
+            if len(corners) and corners.max() >= len(points):
+                raise CloudFileError(
+                    f"a primitive names vertex {corners.max()}, wanted 0 to {len(points) - 1}"
+                )
+        if mode == _TRIANGLES:
+            return points, corners[: len(corners) // 3 * 3].reshape(-1, 3)
+        ends = np.arange(2, max(len(corners), 2))
+        if mode == _FAN:
+            return points, corners[np.stack([0 * ends, ends - 1, ends], axis=1)]
+        odd = ends % 2  # every other triangle of a strip runs the other way around
+        return points, corners[np.stack([ends - 2 + odd, ends - 1 - odd, ends], axis=1)]
+
+    def _accessor(self, index: int, kind: str) -> np.ndarray:
+        """The rows an accessor stands for, (n, 1) or (n, 3), in floats or integers."""
+        accessor = self._item("accessors", index)
+        code = _get(accessor, "componentType", int)
+        if _get(accessor, "type", str) != kind or code not in _COMPONENTS or "sparse" in accessor:
+            raise CloudFileError(f"accessor {index}: wanted {kind} of plain numbers")
+        dtype, width = np.dtype(_COMPONENTS[code]), _WIDTHS[kind]
+        view = self._item("bufferViews", _get(accessor, "bufferView", int))
+        data = self._buffer(_get(view, "buffer", int))
+        begin, size = _get(view, "byteOffset", int, 0), _get(view, "byteLength", int)
+        skipped, count = _get(accessor, "byteOffset", int, 0), _get(accessor, "count", int)
+        stride = _get(view, "byteStride", int, dtype.itemsize * width)
+        last = skipped + stride * (count - 1) + dtype.itemsize * width
+        if (
+            min(begin, skipped) < 0
+            or count < 1
+            or stride < dtype.itemsize * width
+            or last > size
+            or begin + size > len(data)
+        ):
+            raise CloudFileError(
+                f"accessor {index}: {count} rows, {stride} bytes apart, end {last} bytes into a "
+                f"view of {size} at byte {begin} of a buffer of {len(data)}"
+            )
+        strides = (stride, dtype.itemsize)
+        rows = np.ndarray((count, width), dtype, data, begin + skipped, strides)
+        if kind == "VEC3" and _get(accessor, "normalized", bool, False) and dtype.kind != "f":
+            rows = np.maximum(rows / np.iinfo(dtype).max, -1.0)
+        return rows
+
+    def _buffer(self, index: int) -> bytes:
+        if index not in self.buffers:
+            uri = _get(self._item("buffers", index), "uri", str)
+            if uri.startswith("data:"):
+                head, _, text = uri.partition(",")
+                try:
+                    self.buffers[index] = base64.b64decode(text, validate=True)
+                except ValueError as error:
+                    raise CloudFileError(f"buffer {index}: {head[:60]}: {error}") from None
+            else:
+                self.buffers[index] = self._beside(index, unquote(uri))
+            self.room += _MOST_ROWS_PER_BYTE * len(self.buffers[index])
+        return self.buffers[index]
+
+    def _beside(self, index: int, uri: str) -> bytes:
+        """A buffer in a file of its own; a document may not name files of other folders."""
+        if "\0" in uri or Path(uri).name != uri or not (self.folder / uri).is_file():
+            raise CloudFileError(f"buffer {index}: wanted a file {uri[:80]!r} in the same folder")
+        return (self.folder / uri).read_bytes()
+
+    def _item(self, key: str, index: Any) -> dict:
+        items = _get(self.document, key, list)
+        if type(index) is not int or not 0 <= index < len(items):
+            raise CloudFileError(f"{key}: wanted one of {len(items)}, got {str(index)[:40]}")
+        if not isinstance(items[index], dict):
+            raise CloudFileError(f"{key}: number {index} is no JSON object")
+        return items[index]
+
+
+def _placement(node: dict) -> Float64[np.ndarray, "4 4"]:
+    """A node's transform, of its own frame into the one above."""
+    if "matrix" in node:
+        return _numbers(node, "matrix", [0.0] * 16).reshape(4, 4).T  # stored by columns
+    x, y, z, w = _numbers(node, "rotation", [0.0, 0.0, 0.0, 1.0])
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    placement = np.eye(4)
+    placement[:3, :3] = rotation * _numbers(node, "scale", [1.0, 1.0, 1.0])
+    placement[:3, 3] = _numbers(node, "translation", [0.0, 0.0, 0.0])
+    return placement
+
+
+def _numbers(node: dict, key: str, default: list[float]) -> Float64[np.ndarray, " k"]:
+    values = _get(node, key, list, default)
+    good = all(type(v) in (int, float) and abs(v) <= 1e15 for v in values)
+    if not good or len(values) != len(default):
+        raise CloudFileError(f"{key}: wanted {len(default)} finite numbers, got {str(values)[:80]}")
+    return np.array(values, dtype=np.float64)
+
+
+def _get(item: Any, key: str, kind: type[T], default: T | None = None) -> T:
+    """`item[key]`, of the kind it has to be; without a default it has to be there."""
+    value = item.get(key, default) if isinstance(item, dict) else None
+    if type(value) is not kind:
+        raise CloudFileError(f"{key}: wanted a JSON {kind.__name__}, got {str(value)[:40]!r}")
+    return value

@@ -1,0 +1,115 @@
+"""What happens in the iterations of a registration, one after the other.
+
+`registration.register` runs them for an answer; the loss and the measurements look at what lies
+between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Float
+
+from cfr_jax.geometry import rigid
+from cfr_jax.networks.cfr.modules import CFR
+from cfr_jax.networks.clouds import Cloud, Settings, moved_by
+from cfr_jax.networks.features import raw_features
+from cfr_jax.networks.sinkhorn import Affinity, Match, match
+
+
+@struct.dataclass
+class Encoded:
+    """The reference side of a registration, computed once for any number of sources."""
+
+    cloud: Cloud
+    features: Float[Array, "L m d"]
+
+
+class Step(NamedTuple):
+    """What one iteration found."""
+
+    transform: Float[Array, "4 4"]
+    match: Match
+    affinity: Affinity
+
+
+def iterate(
+    params: dict, source: Cloud, target: Encoded, iterations: int, settings: Settings
+) -> Iterator[Step]:
+    """The iterations of `register`, one by one, for those who need what lies between (the loss).
+
+    This is the scan over the parameters stacked on L, written out: iteration i runs i Sinkhorn
+    passes, and in a compiled loop that count could not be static.
+    """
+    network, count = bind(params), iterations_of(params)
+    reference = target.cloud
+    annealing = network.annealing(source.points, reference.points, source.mask, reference.mask)
+    received = features = _heavy_features(network, source, settings)
+    moved = source
+    for i in range(iterations):
+        layer = min(i, count - 1)
+        if i and settings.repeat_annealing:
+            annealing = network.annealing(
+                moved.points, reference.points, source.mask, reference.mask
+            )
+        if i and settings.repeat_extraction:
+            received = _heavy_features(network, moved, settings)
+        elif i == layer:
+            received = features
+        features = network.cascade.layer(layer, received, moved.points, source.mask)
+        affinity = Affinity(
+            features, target.features[layer], annealing.beta[layer], annealing.alpha[layer]
+        )
+        found = match(
+            affinity,
+            reference.points,
+            passes=layer + 1 if settings.passes is None else settings.passes,
+            form=settings.match,
+            source_mask=source.mask,
+            target_mask=reference.mask,
+        )
+        transform = rigid.fit_rigid(source.points, found.targets, found.weights)
+        yield Step(transform, found, affinity)
+        moved = moved_on(transform, source, settings)
+
+
+def moved_on(transform: Float[Array, "4 4"], source: Cloud, settings: Settings) -> Cloud:
+    """The source where an iteration found it to lie, for what comes next."""
+    return moved_by(lax.stop_gradient(transform) if settings.detach_motion else transform, source)
+
+
+def encoded(params: dict, cloud: Cloud, settings: Settings) -> Encoded:
+    """The features of a reference in every iteration."""
+    network = bind(params)
+    heavy = _heavy_features(network, cloud, settings)
+    if settings.repeat_extraction:
+        layers = range(iterations_of(params))
+        every = [network.cascade.layer(i, heavy, cloud.points, cloud.mask) for i in layers]
+        return Encoded(cloud, jnp.stack(every))
+    return Encoded(cloud, network.cascade.at_rest(heavy, cloud.points, cloud.mask))
+
+
+def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> Iterator[Step]:
+    """The iterations that the parameters were made for, both clouds given as they are."""
+    reference = encoded(params, target, settings)
+    return iterate(params, source, reference, iterations_of(params), settings)
+
+
+def iterations_of(params: dict) -> int:
+    """L, the number of iterations that the parameters were made for."""
+    return params["annealing"]["out"]["bias"].shape[0] // 2
+
+
+def bind(params: dict) -> CFR:
+    """The network with its parameters inside."""
+    shared = params["cascade"]["kernel"].shape[0] == 1
+    return CFR(iterations_of(params), shared).bind({"params": params})
+
+
+def _heavy_features(network, cloud, settings):
+    raw = raw_features(cloud.points, cloud.normals, cloud.neighbors, ppf=settings.ppf)
+    return network.features(raw, cloud.mask)

@@ -1,0 +1,103 @@
+"""A cloud as the network takes it, with normals and neighbors, and the settings of both."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int32
+
+from cfr_jax.geometry import neighbors as knn
+from cfr_jax.geometry import rigid
+from cfr_jax.geometry.normals import estimate_normals
+from cfr_jax.networks.features import PairFeature
+from cfr_jax.networks.sinkhorn import Form
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What changes the compiled program. The defaults are the paper's."""
+
+    neighbors: int = 64
+    radius: float = 0.3
+    """Neighbors further away are replaced by the nearest one; in units of the unit sphere."""
+    ppf: PairFeature = "dot"
+    match: Form = "auto"
+    """How correspondences are found: "dense" stores the N x M affinities, "streamed" makes them
+    anew whenever it needs them, "auto" streams what is large. "log space" is RPM-Net's."""
+    detach_motion: bool = False
+    """Stop gradients at the motion between iterations, as the paper trains."""
+    # What the paper leaves out of RPM-Net, to measure what that saves. Weights answer best with
+    # what they were trained with.
+    passes: int | None = None
+    """Sinkhorn passes of every iteration; None: i passes in iteration i."""
+    repeat_annealing: bool = False
+    """Predict the annealing in every iteration, from where the source is by then."""
+    repeat_extraction: bool = False
+    """Extract the heavy features in every iteration, from the source as it is turned by then,
+    instead of handing on those of the iteration before."""
+
+
+@struct.dataclass
+class Cloud:
+    """A cloud ready for the network: normals and neighbors known; `mask` marks valid rows."""
+
+    points: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+    neighbors: Int32[Array, "n k"]
+    mask: Bool[Array, " n"] | None = None
+
+
+@functools.partial(jax.jit, static_argnames=("settings",))
+def prepare(
+    points: Float[Array, "n c"],
+    *,
+    mask: Bool[Array, " n"] | None = None,
+    neighbors: Int32[Array, "n k"] | None = None,
+    settings: Settings = Settings(),
+) -> Cloud:
+    """A `Cloud` from raw points (n, 3), or points and normals (n, 6).
+
+    Missing normals are estimated (`normals.estimate_normals`); missing neighbors are searched on
+    the device. Fewer than K + 1 points have fewer neighbors each. Raises ValueError on wrong
+    shapes.
+    """
+    check_points("points", points)
+    n = points.shape[0]
+    if mask is not None and mask.shape != (n,):
+        raise ValueError(f"mask: got shape {mask.shape}, wanted ({n},) as there are {n} points")
+    if neighbors is not None and (neighbors.ndim != 2 or neighbors.shape[0] != n):
+        raise ValueError(f"neighbors: got shape {neighbors.shape}, wanted ({n}, k)")
+    points = points.astype(jnp.float64 if points.dtype == jnp.float64 else jnp.float32)
+    normals = points[:, 3:] if points.shape[1] == 6 else None
+    points = points[:, :3]
+    if mask is not None:
+        points = jnp.where(mask[:, None], points, 0)
+    if neighbors is None:
+        k = min(settings.neighbors, n - 1)
+        neighbors = knn.nearest(lax.stop_gradient(points), k, radius=settings.radius, mask=mask)
+    if normals is None:
+        normals = estimate_normals(points, neighbors, mask)
+    elif mask is not None:
+        normals = jnp.where(mask[:, None], normals, 0)
+    return Cloud(points, normals, neighbors, mask)
+
+
+def moved_by(motion: Float[Array, "4 4"], cloud: Cloud) -> Cloud:
+    """The cloud elsewhere: points moved, normals turned."""
+    points, normals = rigid.apply(motion, cloud.points), rigid.rotate(motion, cloud.normals)
+    return Cloud(points, normals, cloud.neighbors, cloud.mask)
+
+
+def check_points(name: str, points: Array) -> None:
+    """Raises ValueError, naming the argument, where its shape is not that of a cloud."""
+    if points.ndim != 2 or points.shape[1] not in (3, 6):
+        raise ValueError(
+            f"{name}: got shape {points.shape}, wanted (n, 3) points or (n, 6) points and normals"
+        )
+    if points.shape[0] < 3:
+        raise ValueError(f"{name}: got {points.shape[0]} points, wanted at least 3")

@@ -1,0 +1,109 @@
+"""What a network alone tells of its answer, and how probable that makes it.
+
+Right means within 5 degrees and a tenth of the unit sphere's radius. The probability is a logistic
+regression on the clues, fitted to validation pairs (`benchmarks/fit_confidence.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from cfr_jax.geometry import rigid
+from cfr_jax.networks import calibration
+
+_HIGHEST = lax.Precision.HIGHEST
+SURE = 30.0  # larger logits are rounding
+
+
+@struct.dataclass
+class NetworkClues:
+    """What the network alone knows of its answer; each is a number of order one."""
+
+    source_found: Float[Array, ""]
+    """Mean correspondence weight of the source."""
+    target_found: Float[Array, ""]
+    settled: Float[Array, ""]
+    """How far the last iteration still turned: log of degrees + 0.1."""
+    settling: Float[Array, ""]
+    """The same of the iteration before."""
+    residual: Float[Array, ""]
+    """How far the matched places lie from where the answer puts the points: log of the weighted
+    root mean square + 0.01."""
+    sharpness: Float[Array, ""]
+    """Log of how far the matched places spread, over how far their points do: where a match is
+    undecided among many points, it points to the middle of them."""
+    lever: Float[Array, ""]
+    """Log of the spread about the axis that holds a rotation the least: the conditioning of the
+    fit."""
+
+
+def of_network(
+    transforms: Float[Array, "L 4 4"],
+    source: Float[Array, "n 3"],
+    targets: Float[Array, "n 3"],
+    weights: Float[Array, " n"],
+    covered: Float[Array, " m"],
+    source_mask: Bool[Array, " n"] | None = None,
+    target_mask: Bool[Array, " m"] | None = None,
+) -> NetworkClues:
+    """The clues of the iterations' `transforms` and of the last match: where it put the points of
+    the source (`targets`), and how much of each point of both clouds it found."""
+    share = weights / (jnp.sum(weights) + 1e-5)
+    away = rigid.apply(transforms[-1], source) - targets
+    square = jnp.sum(share * jnp.sum(away * away, axis=1))
+    places, points = (_spread(cloud, share) for cloud in (targets, source))
+    spread, before_it = jnp.trace(places), jnp.trace(points)
+    # the sum of the two smaller eigenvalues, nearly, and exactly on a line
+    twice = spread * spread - jnp.sum(places * places)
+    lever = twice / (2 * spread + 1e-4)
+    # a single iteration has none before it, and counts as settled
+    earlier, before, last = (transforms[max(len(transforms) - back, 0)] for back in (3, 2, 1))
+    return NetworkClues(
+        source_found=_mean(weights, source_mask),
+        target_found=_mean(covered, target_mask),
+        settled=turned(before, last),
+        settling=turned(earlier, before),
+        residual=jnp.log(square + 1e-4) / 2,
+        sharpness=jnp.log((spread + 1e-4) / (before_it + 1e-4)) / 2,
+        lever=jnp.log(lever + 1e-4) / 2,
+    )
+
+
+def of_registration(clues: NetworkClues) -> Float[Array, ""]:
+    """Probability in [0, 1] that the network's own answer is right."""
+    sure = logit(calibration.REGISTER, vars(clues))
+    return 1 / (1 + jnp.exp(-jnp.clip(sure, -SURE, SURE)))
+
+
+def logit(fitted: Mapping[str, float], clues: Mapping[str, Any]) -> Any:
+    """The bias and the weighted sum of the clues, by name."""
+    return fitted["bias"] + sum(
+        weight * clues[name] for name, weight in fitted.items() if name != "bias"
+    )
+
+
+def _mean(values, mask):
+    if mask is None:
+        return jnp.mean(values)
+    valid = mask.astype(values.dtype)
+    return jnp.sum(values * valid) / jnp.maximum(jnp.sum(valid), 1)
+
+
+def turned(first, second):
+    """Log of degrees + 0.1; its slope is bounded where motions are equal or half a turn apart."""
+    chord = jnp.sum((first[:3, :3] - second[:3, :3]) ** 2)
+    half_sine = jnp.minimum(jnp.sqrt(chord / 8 + 1e-12), 1 - 1e-6)
+    return jnp.log(jnp.rad2deg(2 * jnp.arcsin(half_sine)) + 0.1)
+
+
+def _spread(points, share):
+    """Covariance of weighted points."""
+    center = jnp.matmul(share, points, precision=_HIGHEST)
+    offset = points - center
+    return jnp.matmul(offset.T, share[:, None] * offset, precision=_HIGHEST)

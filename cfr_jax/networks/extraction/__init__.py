@@ -1,0 +1,70 @@
+"""The heavy part: a shared MLP on every neighbor of every point, pooled by maximum.
+
+Three layers of Linear, GroupNorm and ReLU see n k rows per cloud, and the norm's statistics run
+over all of them, so the plain form writes and reads n k 96 floats eight times, and four times that
+for its gradient. Here tiles of points stay in a cache, and at most one such array is ever stored.
+
+- The first layer's statistics follow exactly from the mean and covariance of the seven raw
+  channels.
+- One pass over the tiles sums the second layer's output for its statistics, and keeps it, as far as
+  `tiles.KEPT` allows; beyond, it is made again when it is needed.
+- A second pass sums the third layer's output and keeps its largest value over the neighbors. The
+  norm and the ReLU are monotonic per channel, so the pooled feature is that value, normalized.
+  (Where the norm's scale is negative it is the smallest value: the sign is folded into the
+  weights.)
+
+The gradient is written out for the same reason. Through a norm it is the incoming gradient minus
+its projections on 1 and on the normalized values, and both projections are sums over rows: the last
+layer's follow from the pooled values alone, the first layer's from sums of seven channels.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from cfr_jax.networks.extraction.backward import backward
+from cfr_jax.networks.extraction.forward import forward
+from cfr_jax.networks.layers import Layer
+from cfr_jax.runtime.vectorizing import cloud_by_cloud
+
+__all__ = ["pooled_features"]
+
+
+@functools.partial(jax.jit, static_argnames=("groups",))
+def pooled_features(
+    layers: tuple[Layer, Layer, Layer],
+    raw: Float[Array, "n k c"],
+    *,
+    groups: int,
+    mask: Bool[Array, " n"] | None = None,
+) -> Float[Array, "n d"]:
+    """Per-neighbor MLP and maximum over the neighbors, one feature per point.
+
+    Rows of masked points enter no statistic; their own features are zero. Differentiates by its own
+    rule, once, with memory for one activation (at most `tiles.KEPT` numbers of it) and its
+    gradient.
+    """
+    n = raw.shape[0]
+    valid = jnp.ones(n, raw.dtype) if mask is None else mask.astype(raw.dtype)
+    return _pooled(layers, raw, valid, groups) * valid[:, None]
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _pooled(layers, raw, valid, groups):
+    return _pooled_fwd(layers, raw, valid, groups)[0]
+
+
+def _pooled_fwd(layers, raw, valid, groups):
+    pooled, kept = cloud_by_cloud(functools.partial(forward, groups=groups))(layers, raw, valid)
+    return pooled, (layers, raw, valid, kept)
+
+
+def _pooled_bwd(groups, residuals, gradient):
+    return cloud_by_cloud(functools.partial(backward, groups=groups))(*residuals, gradient)
+
+
+_pooled.defvjp(_pooled_fwd, _pooled_bwd)

@@ -1,0 +1,108 @@
+"""Linear, GroupNorm, ReLU and the maximum over all points, in one go: PointNet's wide last layer.
+
+Of n rows of 1,024 channels only one row per channel survives the maximum. The norm's statistics
+follow from the mean and covariance of the narrow input, the norm and the ReLU are monotonic, so the
+maximum can be taken before them; and the gradient is one row per channel, plus what the norm takes
+out of it, which is linear in the input: a product as narrow as the input instead of one as wide as
+the output. What is as wide as the output is made for a tile of rows at a time.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from cfr_jax.networks.layers import Layer, norm_of, projections
+
+_HIGHEST = lax.Precision.HIGHEST  # for what becomes a variance
+_TILE_ROWS = 1 << 14  # 64 MiB of 1,024 channels; clouds of the usual size are one tile
+
+
+def pooled_layer(
+    layer: Layer,
+    x: Float[Array, "n i"],
+    *,
+    groups: int,
+    mask: Bool[Array, " n"] | None = None,
+) -> Float[Array, " o"]:
+    """max over the valid rows of relu(groupnorm(x kernel + bias)), with a derivative of its own."""
+    valid = jnp.ones(x.shape[0], x.dtype) if mask is None else mask.astype(x.dtype)
+    return _pooled(layer, x, valid, groups)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _pooled(layer, x, valid, groups):
+    return _forward(layer, x, valid, groups)[0]
+
+
+def _forward(layer, x, valid, groups):
+    count = jnp.maximum(jnp.sum(valid), 1)
+    mean = valid @ x / count
+    centered = (x - mean) * valid[:, None]
+    covariance = jnp.matmul(centered.T, centered, precision=_HIGHEST) / count
+    channel_mean = mean @ layer.kernel + layer.bias
+    norm = norm_of(channel_mean, ((covariance @ layer.kernel) * layer.kernel).sum(0), groups)
+    # for a negative scale the smallest value becomes the largest
+    sign = jnp.where(layer.scale >= 0, 1, -1).astype(x.dtype)
+    high, chosen = _highest(x, layer.kernel * sign, valid)
+    normal = (high * sign + layer.bias - norm.mean) * norm.rate
+    pooled = jax.nn.relu(normal * layer.scale + layer.shift)
+    return pooled, (layer, x, valid, (mean, covariance, channel_mean), norm, normal, chosen)
+
+
+def _highest(x, kernel, valid):
+    """Per channel the largest value of x kernel over the valid rows, and the first row that has it;
+    0 and some row where none is valid."""
+    n = x.shape[0]
+
+    def of_tile(x, valid, start):
+        z = jnp.where(valid[:, None] > 0, x @ kernel, -jnp.inf)
+        high = jnp.max(z, axis=0)
+        # two plain reductions: XLA's argmax on CPU is not vectorized
+        rows = start + jnp.arange(x.shape[0], dtype=jnp.int32)[:, None]
+        return high, jnp.min(jnp.where(z >= high, rows, n - 1), axis=0)
+
+    if n <= _TILE_ROWS:
+        high, chosen = of_tile(x, valid, 0)
+    else:
+
+        def merge(best, tile):
+            high, chosen = of_tile(*tile)
+            higher = high > best[0]
+            return (jnp.where(higher, high, best[0]), jnp.where(higher, chosen, best[1])), None
+
+        count = -(-n // _TILE_ROWS)
+        more = count * _TILE_ROWS - n
+        tiles = (
+            jnp.pad(x, ((0, more), (0, 0))).reshape(count, _TILE_ROWS, -1),
+            jnp.pad(valid, (0, more)).reshape(count, _TILE_ROWS),
+            _TILE_ROWS * jnp.arange(count, dtype=jnp.int32),
+        )
+        lowest = jnp.full(kernel.shape[1], -jnp.inf, x.dtype), jnp.zeros(kernel.shape[1], jnp.int32)
+        (high, chosen), _ = lax.scan(merge, lowest, tiles)
+    return jnp.where(jnp.isfinite(high), high, 0), jnp.minimum(chosen, n - 1)
+
+
+def _backward(groups, residuals, gradient):
+    layer, x, valid, (mean, covariance, channel_mean), norm, normal, chosen = residuals
+    count = jnp.maximum(jnp.sum(valid), 1)
+    shift = jnp.where(normal * layer.scale + layer.shift > 0, gradient, 0)
+    scale = shift * normal
+    flat, tilt = projections(layer, shift, scale, count, groups)
+    sparse = shift * layer.scale * norm.rate
+    # the normalized values are slope (x - mean) + offset
+    slope, offset = layer.kernel * norm.rate, (channel_mean - norm.mean) * norm.rate
+    level = (flat + tilt * offset) * norm.rate
+    steep = tilt * norm.rate
+    kernel = x[chosen].T * sparse - count * (jnp.outer(mean, level) + (covariance @ slope) * steep)
+    dense = level @ layer.kernel.T + (x - mean) @ ((slope * steep) @ layer.kernel.T)
+    d_x = -dense * valid[:, None]
+    d_x = d_x.at[chosen].add(sparse[:, None] * layer.kernel.T)
+    return Layer(kernel, sparse - count * level, scale, shift), d_x, jnp.zeros_like(valid)
+
+
+_pooled.defvjp(_forward, _backward)

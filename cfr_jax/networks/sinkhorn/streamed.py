@@ -1,0 +1,205 @@
+"""The match without its block: rows are made from the features when they are needed, and dropped.
+
+A pass needs all columns of a row to scale it, and all rows of a column to scale that. So blocks of
+whole rows go by: each is scaled and at once adds its share to the columns. One sweep over the block
+is one pass, and one more sums the targets. What is kept is u, v and a block of rows.
+
+The gradient goes the same way backwards. With a and b the gradients of the column and the row sums,
+pass p sends a = -v^2 dv to the rows, b = -u^2 (m a) to the columns of the pass before it, as
+dv = m' b. In the end the gradient of log m_ij is m_ij times a product of two thin matrices,
+sum_p (u_i a_j + b_i v_j) and the weighted targets, and is spent on the features in the same sweep.
+It takes as many sweeps as the forward direction; the last of them does three times the work.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from cfr_jax.networks.sinkhorn.affinity import (
+    EPSILON,
+    Affinity,
+    Match,
+    log_affinity,
+    masked,
+    match_of,
+    squared_distances,
+    with_ones,
+)
+
+# A block has so many entries, 16 MiB of float32, and for a large target as many rows as make the
+# product with its features worth reading them.
+_ENTRIES = 1 << 22
+_LEAST_ROWS = 128
+_HIGHEST = lax.Precision.HIGHEST
+
+
+def match_streamed(
+    affinity: Affinity,
+    points: Float[Array, "m 3"],
+    *,
+    passes: int,
+    source_mask: Bool[Array, " n"] | None = None,
+    target_mask: Bool[Array, " m"] | None = None,
+    rows: int | None = None,
+) -> Match:
+    """`match`, with memory for n + m rows and a block of at most `rows` rows. Differentiates by its
+    own rule, once."""
+    n, m = affinity.source.shape[0], affinity.target.shape[0]
+    everywhere = (jnp.ones(count, bool) for count in (n, m))
+    masks = [
+        default if mask is None else mask
+        for mask, default in zip((source_mask, target_mask), everywhere, strict=True)
+    ]
+    rows = max(_LEAST_ROWS, _ENTRIES // m) if rows is None else rows
+    return _streamed(affinity, points, tuple(masks), passes, rows)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _streamed(affinity, points, masks, passes, most_rows):
+    return _forward(affinity, points, masks, passes, most_rows)[0]
+
+
+def _forward(affinity, points, masks, passes, most_rows):
+    n, m = affinity.source.shape[0], affinity.target.shape[0]
+    blocks = _Blocks(affinity, masks, most_rows)
+    tiny = jnp.finfo(points.dtype).tiny
+
+    def one_pass(v, shift=None):
+        def rows(found, here):
+            block, _, shift = blocks.make(*here)
+            sums = jnp.matmul(block, v, precision=_HIGHEST) + jnp.exp(-shift)
+            u = 1 / jnp.maximum(sums, tiny)
+            return found + jnp.matmul(u, block, precision=_HIGHEST), (u, shift)
+
+        given = (blocks.rows,) if shift is None else (blocks.rows, shift)
+        found, (u, shift) = lax.scan(rows, jnp.zeros(m, v.dtype), given)
+        return 1 / (found + 1), (u, v, found), shift
+
+    # The shift of a row is its largest entry, in every pass the same: the first one finds it.
+    v, first, shift = one_pass(jnp.ones(m, points.dtype))
+    v, others = lax.scan(lambda v, _: one_pass(v, shift)[:2], v, None, length=passes - 1)
+    u, v_before, found = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, others)
+    weighted = v[:, None] * with_ones(points)
+
+    def last(here):
+        rows, shift, u = here
+        return u[:, None] * jnp.matmul(blocks.make(rows, shift)[0], weighted, precision=_HIGHEST)
+
+    sums = lax.map(last, (blocks.rows, shift, u[-1])).reshape(-1, 4)[:n]
+    result = match_of(sums, v * found[-1])
+    return result, (affinity, points, masks, u, v_before, v, shift, sums)
+
+
+def _backward(passes, most_rows, residuals, gradient):
+    affinity, points, masks, u, v_before, v, shift, sums = residuals
+    n, m = affinity.source.shape[0], affinity.target.shape[0]
+    blocks = _Blocks(affinity, masks, most_rows)
+    rows = (blocks.rows, shift)
+    tiny = jnp.finfo(points.dtype).tiny
+
+    # from the match to the sums, to the last scaling of the rows
+    inverse = 1 / (sums[:, 3:] + EPSILON)
+    of_points = gradient.targets * inverse
+    of_weights = gradient.weights - jnp.sum(of_points * sums[:, :3] * inverse, axis=1)
+    of_sums = jnp.concatenate([of_points, of_weights[:, None]], axis=1)
+    pull = blocks.cut(of_sums) * u[-1][..., None]
+    of_u = jnp.sum(blocks.cut(of_sums * sums), axis=-1) / u[-1]
+
+    def columns(total, here):
+        rows, pull = here
+        block, *_ = blocks.make(*rows)
+        return total + jnp.matmul(block.T, pull, precision=_HIGHEST), None
+
+    of_weighted, _ = lax.scan(columns, jnp.zeros((m, 4), points.dtype), (rows, pull))
+    one = with_ones(points)
+    of_v = jnp.sum(of_weighted * one, axis=1) - gradient.covered  # covered is 1 - v
+
+    def of_rows(block, a, u, of_u):
+        sums = jnp.matmul(block, a, precision=_HIGHEST) + of_u
+        # where the floor was reached, nothing depends on the row
+        return jnp.where(u * tiny < 1, -u * (u * sums), 0)
+
+    def back(state, one_pass):
+        of_v, of_u = state
+        u, v = one_pass
+        a = -v * (v * of_v)
+
+        def step(total, here):
+            rows, u, of_u = here
+            block, *_ = blocks.make(*rows)
+            b = of_rows(block, a, u, of_u)
+            return total + jnp.matmul(b, block, precision=_HIGHEST), b
+
+        of_v, b = lax.scan(step, jnp.zeros_like(v), (rows, u, of_u))
+        return (of_v, jnp.zeros_like(of_u)), (a, b)
+
+    v_after = jnp.concatenate([v_before[1:], v[None]])
+    (of_v, of_u), (a, b) = lax.scan(back, (of_v, of_u), (u[1:], v_after[1:]), reverse=True)
+    a_first = -v_after[0] * (v_after[0] * of_v)
+    a = jnp.concatenate([a_first[None], a])
+
+    # log m_ij receives m_ij times left_i . right_j
+    right = jnp.concatenate([a, v_before, (v[:, None] * one).T])
+
+    def spend(state, here):
+        rows, u, b, pull, of_u = here
+        of_target, of_beta, of_alpha = state
+        block, square, _ = blocks.make(*rows)
+        b_first = of_rows(block, a_first, u[0], of_u)
+        left = jnp.concatenate([u, b_first[None], b, pull.T])
+        share = block * jnp.matmul(left.T, right, precision=_HIGHEST)
+        state = (
+            of_target + jnp.matmul(share.T, rows[0][0], precision=_HIGHEST),
+            of_beta + jnp.sum(share * (affinity.alpha - square)),
+            of_alpha + jnp.sum(share),
+        )
+        return state, jnp.matmul(share, affinity.target, precision=_HIGHEST)
+
+    zero = jnp.zeros((), points.dtype)
+    per_block = (rows, jnp.moveaxis(u, 0, 1), jnp.moveaxis(b, 0, 1), pull, of_u)
+    (of_target, of_beta, of_alpha), of_source = lax.scan(
+        spend, (jnp.zeros_like(affinity.target), zero, zero), per_block
+    )
+    twice = 2 * affinity.beta
+    of_affinity = Affinity(
+        twice * of_source.reshape(-1, of_source.shape[-1])[:n],
+        twice * of_target,
+        of_beta,
+        affinity.beta * of_alpha,
+    )
+    return of_affinity, (v[:, None] * of_weighted)[:, :3], None
+
+
+_streamed.defvjp(_forward, _backward)
+
+
+class _Blocks:
+    """The block in pieces: rows of the source, cut and padded, made into affinities on demand."""
+
+    def __init__(self, affinity, masks, most_rows):
+        self.affinity, self.target_mask = affinity, masks[1]
+        n = affinity.source.shape[0]
+        self.count = -(-n // most_rows)
+        self.size = -(-n // self.count)
+        self.rows = self.cut(affinity.source), self.cut(masks[0])  # the padding is masked
+
+    def cut(self, values: Float[Array, "n ..."] | Bool[Array, " n"]) -> Array:
+        """(n, ...) as (blocks, rows, ...)."""
+        more = self.count * self.size - values.shape[0]
+        padded = jnp.pad(values, [(0, more)] + [(0, 0)] * (values.ndim - 1))
+        return padded.reshape(self.count, self.size, *values.shape[1:])
+
+    def make(self, rows, shift=None) -> tuple[Array, Array, Array]:
+        """exp(log m - shift), the squared distances, and the shift of a block of rows."""
+        features, mask = rows
+        beta, alpha = self.affinity.beta, self.affinity.alpha
+        square = squared_distances(features, self.affinity.target)
+        log_values = masked(log_affinity(square, beta, alpha), mask, self.target_mask)
+        if shift is None:
+            shift = jnp.maximum(jnp.max(log_values, axis=1), 0)
+        return jnp.exp(log_values - shift[:, None]), square, shift

@@ -1,0 +1,189 @@
+"""Local refinement of a registration: generalized ICP with a shrinking, robust cut.
+
+The network brings a cloud to within a few degrees; what is left is a smooth least-squares problem.
+Generalized ICP (Segal, Haehnel & Thrun, 2009) models each point as a small plane: it forgives a
+wide cut better than point-to-plane distances do, and needs only the direction of normals, not their
+sign.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from cfr_jax.geometry import rigid
+from cfr_jax.geometry.neighbors import closest
+
+_HIGHEST = lax.Precision.HIGHEST
+
+
+class Stage(NamedTuple):
+    """How far points may be from each other, and what shape they have."""
+
+    cut: float
+    """In units of the unit sphere."""
+    thickness: float
+    """Variance of a point's plane across it, as a share of that along it."""
+
+
+# Wide enough at first for what a network leaves, and at last no wider than the surface's own noise
+# and spacing. Thin planes slide past each other and find the way from afar; thick ones, between
+# planes and balls, use the points themselves, and end more precisely on noisy clouds.
+STAGES = (Stage(0.2, 0.01), Stage(0.1, 0.01), Stage(0.05, 0.1))
+CUT = STAGES[-1].cut
+_STEPS_PER_CUT = 12
+_SETTLED = 1e-5  # radians and units: smaller updates end a stage
+
+
+@struct.dataclass
+class Surface:
+    """Points with normals, `mask` marking the valid rows."""
+
+    points: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+    mask: Bool[Array, " n"]
+
+
+@struct.dataclass
+class Refinement:
+    """Answer of `refine`."""
+
+    transform: Float[Array, "4 4"]
+    """Maps source onto target; the initial one where refining made the score worse."""
+    improved: Bool[Array, ""]
+    converged: Bool[Array, ""]
+    """Whether the last stage ended because nothing moved any more."""
+    steps: Int[Array, ""]
+
+
+def refine(
+    source: Surface,
+    target: Surface,
+    initial: Float[Array, "4 4"],
+    stages: tuple[Stage, ...] = STAGES,
+) -> Refinement:
+    """Refines `initial`, which maps source onto target, within the unit sphere.
+
+    Where `descend` ends is kept only if it scores no worse than `initial` (`score` at the last
+    cut).
+    """
+    transform, steps, settled = descend(source, target, initial, stages)
+    before, after = (score(source, target, t, stages[-1].cut) for t in (initial, transform))
+    improved = after <= before
+    return Refinement(jnp.where(improved, transform, initial), improved, settled, steps)
+
+
+def descend(
+    source: Surface,
+    target: Surface,
+    initial: Float[Array, "4 4"],
+    stages: tuple[Stage, ...] = STAGES,
+) -> tuple[Float[Array, "4 4"], Int[Array, ""], Bool[Array, ""]]:
+    """Where generalized ICP ends, in how many steps, and whether the last stage came to rest.
+
+    In each stage: pair every source point with its closest target point, weigh the pairs
+    down to zero at the cut (Tukey's biweight), take a Gauss-Newton step on SE(3), until nothing
+    moves.
+    """
+
+    def run(transform, stage):
+        transform, steps, settled = _run_stage(source, target, transform, stage)
+        return transform, (steps, settled)
+
+    # a scan, so that the stages share one compiled loop
+    transform, (steps, settled) = lax.scan(run, initial, Stage(*jnp.array(stages, initial.dtype).T))
+    return transform, jnp.sum(steps), settled[-1]
+
+
+def score(
+    source: Surface, target: Surface, transform: Float[Array, "4 4"], cut: float
+) -> Float[Array, ""]:
+    """Mean over the source of Tukey's biweight loss of the distance to the target; in [0, 1].
+
+    It is 1 - (1 - d^2 / cut^2)^3, and 1 beyond the cut: what the weights of a descent belong to.
+    """
+    found = closest(rigid.apply(transform, source.points), target.points, target.mask)
+    loss = 1 - jnp.maximum(1 - found.square / cut**2, 0) ** 3
+    valid = source.mask.astype(loss.dtype)
+    return jnp.sum(loss * valid) / jnp.maximum(jnp.sum(valid), 1)
+
+
+def _run_stage(source, target, transform, stage):
+    def unsettled(state):
+        _, step, size = state
+        return (step < _STEPS_PER_CUT) & (size > _SETTLED)
+
+    def step(state):
+        transform, count, _ = state
+        twist = _gauss_newton(source, target, transform, stage)
+        return rigid.compose(rigid.exp(twist), transform), count + 1, jnp.max(jnp.abs(twist))
+
+    start = (transform, jnp.zeros((), jnp.int32), jnp.array(jnp.inf, transform.dtype))
+    transform, steps, size = lax.while_loop(unsettled, step, start)
+    return transform, steps, size <= _SETTLED
+
+
+def _gauss_newton(source, target, transform, stage):
+    """The twist that lessens sum_i w_i r_i' M_i r_i the most, r = T x - y, linearized."""
+    found = closest(rigid.apply(transform, source.points), target.points, target.mask)
+    partners = target.points[found.index], target.normals[found.index]
+    return solve(*normal_equations(source, *partners, transform, stage))
+
+
+def normal_equations(
+    source: Surface,
+    partners: Float[Array, "n 3"],
+    partner_normals: Float[Array, "n 3"],
+    transform: Float[Array, "4 4"],
+    stage: Stage,
+) -> tuple[Float[Array, "6 6"], Float[Array, " 6"]]:
+    """What one Gauss-Newton step solves, summed over the pairs of source points and partners;
+    sums over parts of a cloud add up. Pairs further apart than the cut have no say."""
+    moved = rigid.apply(transform, source.points)
+    residual = moved - partners
+    weight = jnp.maximum(1 - jnp.sum(residual**2, axis=1) / stage.cut**2, 0) ** 2
+    weight = jnp.where(source.mask, weight, 0)
+    normals = rigid.rotate(transform, source.normals), partner_normals
+    metric = weight[:, None, None] * _inverse_symmetric(
+        sum(_plane(n, stage.thickness) for n in normals)
+    )
+    # a left twist (turn, slide) moves p by turn x p + slide
+    turn = -jax.vmap(rigid.skew)(moved)
+    jacobian = jnp.concatenate(
+        [turn, jnp.broadcast_to(jnp.eye(3, dtype=turn.dtype), turn.shape)], axis=2
+    )
+    weighted = jnp.einsum("nij,nik->njk", metric, jacobian, precision=_HIGHEST)
+    system = jnp.einsum("nji,njk->ik", jacobian, weighted, precision=_HIGHEST)
+    return system, jnp.einsum("nij,ni->j", weighted, residual, precision=_HIGHEST)
+
+
+def solve(system: Float[Array, "6 6"], pull: Float[Array, " 6"]) -> Float[Array, " 6"]:
+    """The step: a left twist, rotation first."""
+    # keeps directions that nothing determines (a line turning about itself) at rest
+    damping = 1e-6 * jnp.trace(system) + jnp.finfo(system.dtype).tiny
+    return -jnp.linalg.solve(system + damping * jnp.eye(6, dtype=system.dtype), pull)
+
+
+def _plane(normals, thickness):
+    """Covariance of a small plane: thin along the normal, one across; round where there is none."""
+    outer = normals[:, :, None] * normals[:, None, :]
+    return jnp.eye(3, dtype=normals.dtype) - (1 - thickness) * outer
+
+
+def _inverse_symmetric(m):
+    """Inverses of (n, 3, 3) symmetric matrices by cofactors; ours are far from singular."""
+    a, b, c = m[:, 0, 0], m[:, 0, 1], m[:, 0, 2]
+    d, e, f = m[:, 1, 1], m[:, 1, 2], m[:, 2, 2]
+    cofactors = jnp.stack(
+        [d * f - e * e, c * e - b * f, b * e - c * d]
+        + [c * e - b * f, a * f - c * c, b * c - a * e]
+        + [b * e - c * d, b * c - a * e, a * d - b * b],
+        axis=1,
+    )
+    determinant = a * cofactors[:, 0] + b * cofactors[:, 1] + c * cofactors[:, 2]
+    return (cofactors / determinant[:, None]).reshape(-1, 3, 3)

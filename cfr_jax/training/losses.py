@@ -1,0 +1,105 @@
+"""What training minimizes, for one pair of clouds; batches are maps over these."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from cfr_jax.geometry import rigid
+from cfr_jax.networks.cfr.iterations import Step
+from cfr_jax.networks.clouds import Cloud
+
+_DISCOUNT = 0.5  # the last iteration counts fully, each one before it half of the next
+_INLIER_WEIGHT = 0.01
+# Soft targets of the correspondence term, in the unit sphere: measured to learn faster than the
+# pose alone (docs/training.md).
+_SPREAD = 0.035
+_REACH = 0.1
+
+
+@struct.dataclass
+class PairLoss:
+    """Loss of a pair, its parts, and the errors that people read."""
+
+    total: Float[Array, ""]
+    pose: Float[Array, ""]
+    correspondence: Float[Array, ""]
+    rotation_error: Float[Array, " L"]
+    """Degrees, per iteration."""
+    translation_error: Float[Array, " L"]
+    beta: Float[Array, " L"]
+    alpha: Float[Array, " L"]
+
+
+def pair_loss(
+    steps: Iterable[Step],
+    source: Cloud,
+    target: Cloud,
+    truth: Float[Array, "4 4"],
+    *,
+    correspondence_weight: float,
+) -> PairLoss:
+    """The paper's loss of what a network found in its `steps`, and a term for the correspondences.
+
+    Pose: mean |T_i x - T_truth x| over points and axes, plus 0.01 times the mean slack of both
+    clouds, discounted by 0.5 per iteration before the last. Correspondence: see
+    `correspondence_loss`; same discount; it stores the affinities, however they were matched.
+    `truth` maps source onto target.
+    """
+    steps = list(steps)
+    there = rigid.apply(truth, source.points)
+    spread = _squared_distances(there, target.points)
+    pose = correspondence = jnp.zeros((), there.dtype)
+    for i, step in enumerate(steps):
+        discount = _DISCOUNT ** (len(steps) - 1 - i)
+        pose += discount * _pose_term(step, source.points, there)
+        if correspondence_weight:
+            correspondence += discount * correspondence_loss(step.affinity.log(), spread)
+    transforms = jnp.stack([step.transform for step in steps])
+    return PairLoss(
+        total=pose + correspondence_weight * correspondence,
+        pose=pose,
+        correspondence=correspondence,
+        rotation_error=jax.vmap(rigid.rotation_error, (0, None))(transforms, truth),
+        translation_error=jax.vmap(rigid.translation_error, (0, None))(transforms, truth),
+        beta=jnp.stack([step.affinity.beta for step in steps]),
+        alpha=jnp.stack([step.affinity.alpha for step in steps]),
+    )
+
+
+def _pose_term(step: Step, points, there):
+    distance = jnp.mean(jnp.abs(rigid.apply(step.transform, points) - there))
+    slack = jnp.mean(1 - step.match.covered) + jnp.mean(1 - step.match.weights)
+    return distance + _INLIER_WEIGHT * slack
+
+
+def correspondence_loss(
+    log_affinity: Float[Array, "n m"], squared_distance: Float[Array, "n m"]
+) -> Float[Array, ""]:
+    """Cross-entropy of each row's and each column's affinities, slack included, to soft targets.
+
+    `squared_distance` is taken under the true motion. A point's partners share, by
+    exp(-d^2 / 2 sigma^2) up to 0.1, as much as the nearest of them is close; the slack has the
+    rest.
+    """
+    close = jnp.exp(squared_distance / (-2 * _SPREAD**2))
+    close = jnp.where(squared_distance < _REACH**2, close, 0)
+    return 0.5 * sum(_cross_entropy(log_affinity, close, axis) for axis in (0, 1))
+
+
+def _cross_entropy(log_affinity, close, axis):
+    found = jnp.max(close, axis=axis)
+    share = found / jnp.maximum(jnp.sum(close, axis=axis), 1e-12)
+    # the slack's logit is 0
+    top = jax.lax.stop_gradient(jnp.maximum(jnp.max(log_affinity, axis=axis, keepdims=True), 0))
+    normalizer = jnp.sum(jnp.exp(log_affinity - top), axis=axis) + jnp.exp(-top.squeeze(axis))
+    log_normalizer = jnp.log(normalizer) + top.squeeze(axis)
+    return jnp.mean(log_normalizer - share * jnp.sum(close * log_affinity, axis=axis))
+
+
+def _squared_distances(a, b):
+    return sum((a[:, axis, None] - b[None, :, axis]) ** 2 for axis in range(3))

@@ -1,0 +1,115 @@
+"""The same measurements for TensorBoard, with histograms and pictures, where it is installed.
+
+The records are tensorboardX's, but not its usual writer, which works in a thread: where a disk is
+full, that dies unheard, and the training waits for it for ever.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cfr_jax.training.losses import PairLoss
+from cfr_jax.training.reporting.log import writing
+from cfr_jax.viewer.picture import write_picture
+from cfr_jax.viewer.scene import Scene
+
+_SCALARS = ("loss", "pose", "correspondence", "learning_rate", "steps_per_second", "skipped")
+_VALIDATIONS = ("rotation_mean", "rotation_median", "translation_mean", "recall_5deg_0.1")
+_BINS = 30  # of a histogram
+MISSING = 'no TensorBoard files: pip install "cfr_jax[train]" to have them'
+NO_PICTURES = 'no pictures among the TensorBoard files: pip install "cfr_jax[viz]" to have them'
+
+
+class Board:
+    """Event files in `folder`. Without tensorboardX there are none, without matplotlib no pictures
+    in them; `missing` says so.
+
+    Every method raises OSError, naming the folder, where it cannot be written.
+    """
+
+    def __init__(self, folder: Path, step: int):
+        self.missing: str | None = None
+        self._folder = folder
+        self._events: Any = None
+        if importlib.util.find_spec("tensorboardX") is None:
+            self.missing = MISSING
+            return
+        self._draws = importlib.util.find_spec("matplotlib") is not None
+        if not self._draws:
+            self.missing = NO_PICTURES
+        from tensorboardX import summary
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+        self._summary, self._event = summary, Event
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._events = EventsWriter(str(folder / "events"))
+            # what an interrupted run wrote after its last checkpoint is hidden
+            self._add(step + 1, session_log=SessionLog(status=SessionLog.START))
+
+    def training(self, line: dict, measured: list[PairLoss]) -> None:
+        """The line of the journal, and how alpha and beta are spread over the pairs."""
+        if self._events is None:
+            return
+        step = line["step"]
+        with writing(self._folder):
+            for name in _SCALARS:
+                if name in line:  # there are no means where no pair was sound
+                    self._scalar(f"training/{name}", line[name], step)
+            for name in ("rotation_error", "translation_error"):
+                for i, value in enumerate(line.get(name, ()), start=1):
+                    self._scalar(f"training/{name}/{i}", value, step)
+            for name in ("alpha", "beta"):
+                spread = np.concatenate([np.asarray(getattr(each, name)) for each in measured])
+                for i, values in enumerate(spread.T, start=1):
+                    if np.isfinite(values).all():
+                        drawn = self._summary.histogram(f"{name}/{i}", values, _BINS)
+                        self._add(step, summary=drawn)
+            self._events.flush()
+
+    def validation(self, step: int, found: dict, pictures: list[tuple[str, Scene]]) -> None:
+        """Errors, and pairs as the network laid them."""
+        if self._events is None:
+            return
+        drawn = [
+            self._summary.image(f"validation/{name}", _pixels(scene), dataformats="HWC")
+            for name, scene in pictures
+            if self._draws
+        ]
+        with writing(self._folder):
+            for name in _VALIDATIONS:
+                self._scalar(f"validation/{name}", found[name], step)
+            for i, value in enumerate(found["rotation_by_iteration"], start=1):
+                self._scalar(f"validation/rotation/{i}", value, step)
+            for picture in drawn:
+                self._add(step, summary=picture)
+            self._events.flush()
+
+    def close(self) -> None:
+        """Ends the file."""
+        if self._events is not None:
+            with writing(self._folder):
+                self._events.close()
+
+    def _scalar(self, name, value, step):
+        self._add(step, summary=self._summary.scalar(name, value))
+
+    def _add(self, step, **content):
+        self._events.write_event(self._event(step=step, wall_time=time.time(), **content))
+
+
+def _pixels(scene: Scene) -> np.ndarray:
+    from matplotlib.image import imread
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "pair.png"
+        write_picture(path, scene)
+        image = imread(path)
+    return (image[..., :3] * 255).astype(np.uint8)

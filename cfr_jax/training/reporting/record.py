@@ -1,0 +1,103 @@
+"""What a checkpoint says of its training, and whether a command goes on with the same one."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from cfr_jax import __version__
+from cfr_jax.weights import files as weights
+
+_NAMED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+WEIGHTS = "weights.safetensors"  # the best so far
+_KEPT = ("step", "best", "validation", "position", "clock", "skipped")
+
+
+def begin(config: Any, stamps: dict[str, str]) -> dict:
+    """What a checkpoint says of itself, before the first step."""
+    versions = {name: importlib.metadata.version(name) for name in _NAMED}
+    versions |= {"cfr_jax": __version__, "python": platform.python_version()}
+    return {
+        "step": 0,
+        "best": {},
+        "validation": {},  # the last one
+        "position": 0,  # pairs of the stream that were used; with the seed it decides all others
+        # of the weights begun with; a step draws nothing
+        "random_key": np.asarray(jax.random.key_data(jax.random.key(config.seed))).tolist(),
+        "skipped": 0,
+        "clock": {"seconds": 0.0, "processor_seconds": 0.0},
+        "config": json.loads(json.dumps(config.to_dict())),
+        "data": stamps,
+        "versions": versions,
+        "started": time.strftime("%Y-%m-%d %H:%M:%S %z"),
+    }
+
+
+def go_on(before: dict, now: dict, total: int, workdir: Path) -> list[str]:
+    """Takes over into `now` what a checkpoint says; words about where it goes on, and what changed.
+
+    The best validation is forgotten where others follow on other pairs: they do not compare.
+    Raises ValueError where the checkpoint's training was on other data, whose order of pairs means
+    nothing here.
+    """
+    if before["data"]["data.train"] != now["data"]["data.train"]:
+        raise ValueError(
+            f"{workdir} holds a training on other data.train (then {before['data']['data.train']}, "
+            f"now {now['data']['data.train']}); wanted another --workdir. To begin there with the "
+            f"weights of this one: --config.train.start_from={workdir / WEIGHTS}"
+        )
+    now |= {key: before[key] for key in _KEPT}
+    done = now["step"]
+    changed = list(_changes(before["config"], now["config"]))
+    told = [f"going on from step {done}"] if done < total else []
+    if changed:
+        told.append(f"the config differs from the checkpoint's: {'; '.join(changed)}")
+    if done < total and before["data"]["data.validation"] != now["data"]["data.validation"]:
+        now["best"] = {}
+        told.append("data.validation holds other pairs than before: the best so far is forgotten")
+    if done >= total:
+        told.append(f"{workdir} has done its {done} steps; for more, raise those of a phase")
+    return told
+
+
+def notes(config: Any, about: dict) -> dict[str, str]:
+    """What a weights file says of its own making."""
+    return {
+        "config": json.dumps(config.to_dict(), sort_keys=True),
+        "validation": json.dumps(about["best"]),
+        "made_by": f"cfr_jax {__version__} train.py",
+    }
+
+
+def holds(file: Path, best: dict) -> bool:
+    """Whether this weights file is there, sound, and that of the validation `best`."""
+    try:
+        return weights.read_weights(file).notes.get("validation") == json.dumps(best)
+    except ValueError:
+        return False
+
+
+def _changes(before: dict, now: dict) -> Iterator[str]:
+    then, here = dict(_flat(before)), dict(_flat(now))
+    for name in sorted(then.keys() | here.keys()):
+        if then.get(name) != here.get(name):
+            yield f"{name} {then.get(name)} → {here.get(name)}"
+
+
+def _flat(tree: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(tree, dict) and tree:
+        for key, value in tree.items():
+            yield from _flat(value, f"{name}.{key}" if name else key)
+    elif isinstance(tree, list) and any(isinstance(value, dict) for value in tree):
+        for place, value in enumerate(tree):
+            yield from _flat(value, f"{name}[{place}]")
+    else:
+        yield name, tree

@@ -1,0 +1,132 @@
+"""Everything that a training reports, in one hand: only the first of several processes speaks."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from cfr_jax.training.devices import is_first
+from cfr_jax.training.learner import Phase
+from cfr_jax.training.losses import PairLoss
+from cfr_jax.training.reporting.board import Board
+from cfr_jax.training.reporting.log import Bar, Clock, Journal, read_journal, summarize
+from cfr_jax.training.reporting.summary import write_summary
+from cfr_jax.training.stopping import Stopped
+from cfr_jax.training.task import Task
+from cfr_jax.training.validation import in_words
+from cfr_jax.viewer.scene import Scene
+
+_PICTURES = 3  # validation pairs drawn for TensorBoard
+
+
+class Reports:
+    """Bar, journal, TensorBoard and the page at the end.
+
+    Measurements stay on the device until they are written. `clock` stands still between `pause`
+    and `resume`.
+    """
+
+    def __init__(self, workdir: Path, task: Task, about: dict):
+        self.clock = Clock(**about["clock"])
+        self._workdir, self._task, self._about = workdir, task, about
+        self._waiting: list[PairLoss] = []
+        self._written = self.clock.read()["seconds"]
+        self._compiling = False
+        self._bar = Bar(task.steps, about["step"], shown=is_first())
+        self._journal = self._board = None
+        if is_first():
+            self._journal = Journal(workdir / "metrics.jsonl", about["step"])
+            self._board = Board(workdir / "tensorboard", about["step"])
+            if self._board.missing:
+                self._bar.say(self._board.missing)
+
+    def __enter__(self) -> Reports:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Ends the bar, and writes the page unless something is wrong."""
+        self._bar.close()
+        if self._journal is not None and self._board is not None:
+            # on a full disk, of two errors the first says what to do
+            with contextlib.nullcontext() if kind is None else contextlib.suppress(OSError):
+                self._board.close()
+            if kind is None or issubclass(kind, Stopped):
+                lines = read_journal(self._journal.path)
+                write_summary(self._workdir / "summary.html", lines, self._about)
+
+    def say(self, text: str) -> None:
+        """A line above the bar."""
+        self._bar.say(text)
+
+    def begin(self, phase: Phase) -> None:
+        """Counts time from here on; the first step of a phase is compiled first."""
+        self._bar.say(
+            f"{phase.steps} steps of {phase.batch} pairs, {phase.points} points, "
+            f"{phase.neighbors} neighbors: compiling, up to a minute"
+        )
+        self._compiling = True
+        self.resume()
+
+    def resume(self) -> None:
+        """Counts time again."""
+        self._bar.forget_time()
+        self.clock.start()
+
+    def pause(self) -> None:
+        """Counts no time until `resume`."""
+        if self._waiting:
+            jax.block_until_ready(self._waiting[-1].total)
+        self.clock.stop()
+
+    def step(self, done: int, measured: PairLoss) -> None:
+        """Takes note of one step, and waits for the one before: the device has always one to do,
+        and never many."""
+        if self._waiting:
+            jax.block_until_ready(self._waiting[-1].total)
+        self._waiting.append(measured)
+        if self._compiling:
+            self._bar.forget_time()
+        self._compiling = False
+        self._bar.step(done)
+
+    def measured(self, done: int, skipped: int) -> None:
+        """Writes the means since the last call."""
+        used, steps = self.clock.read(), len(self._waiting)
+        line = {
+            "step": done,
+            **summarize(self._waiting),
+            # the optimizer has not seen the steps that were left out
+            "learning_rate": float(self._task.schedule(np.int32(max(0, done - 1 - skipped)))),
+            "steps_per_second": steps / max(used["seconds"] - self._written, 1e-9),
+            # all of a training, over its restarts, without validations
+            "training_seconds": used["seconds"],
+            "processor_seconds": used["processor_seconds"],
+            "skipped": skipped,
+            "time": time.time(),
+        }
+        if self._journal is not None and self._board is not None:
+            self._journal.write(line)
+            self._board.training(line, self._waiting)
+        self._waiting, self._written = [], used["seconds"]
+        self._bar.measured(line)
+
+    def validated(self, done: int, found: dict) -> None:
+        """Writes a validation; `found["transforms"]` (b, L, 4, 4) is for the pictures."""
+        shown = {name: value for name, value in found.items() if name != "transforms"}
+        if self._journal is not None and self._board is not None:
+            self._journal.write({"step": done, "validation": shown})
+            self._board.validation(done, shown, self._scenes(found["transforms"]))
+        self._bar.say(f"step {done}: {in_words(found)}")
+
+    def _scenes(self, transforms: np.ndarray) -> list[tuple[str, Scene]]:
+        scenes = []
+        for row in np.linspace(0, len(transforms) - 1, _PICTURES).astype(int).tolist():
+            stations = np.concatenate([np.eye(4)[None], transforms[row]])
+            labels = ["start", *(str(i) for i in range(1, len(stations)))]
+            clouds = self._task.pairs["source"][row], self._task.pairs["target"][row]
+            scenes.append((f"pair_{row}", Scene(*clouds, stations, labels)))
+        return scenes

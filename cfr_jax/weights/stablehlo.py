@@ -1,0 +1,153 @@
+"""`register` as one file: a StableHLO program with its parameters inside, for hosts without this
+package.
+
+What is exported takes clouds of one capacity, padded, with their counts: XLA plans its memory for
+sizes that it knows, and the blocks in which neighbors are searched and features pooled are chosen
+by size. Padding changes no answer. The number of pairs may stay open (`batch=True`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import export as jax_export
+from jaxtyping import Array, Float, Int32
+from numpy.typing import ArrayLike
+
+from cfr_jax.networks.cfr.registration import register
+from cfr_jax.networks.clouds import Settings, prepare
+from cfr_jax.runtime.atomic import write_atomically
+
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+OUTPUTS = ("transform", "transforms", "weights", "covered")
+
+
+def export_register(
+    params: dict,
+    *,
+    points: int,
+    platforms: Sequence[str] = ("cpu",),
+    normals: bool = False,
+    batch: bool = False,
+    settings: Settings | None = None,
+) -> jax_export.Exported:
+    """The program `(source, source_count, target, target_count) -> dict` for these platforms.
+
+    Clouds are (points, 3) float32, or (points, 6) with unit normals if `normals`; their first
+    `count` rows count (int32), the others may hold anything finite. As for `register`, both are
+    centered and of about unit size. The dict holds "transform" (4, 4), source onto target,
+    "transforms" (L, 4, 4), "weights" (points,) and "covered" (points,). With `batch` every
+    argument and result has one more axis in front, of any length. Counts below
+    `settings.neighbors` + 1 leave points with repeated neighbors.
+
+    Neighbors and missing normals are found inside, on the device. Parameters are constants of the
+    program. Differentiating an exported program is not supported. Raises ValueError for too few
+    points, and for unknown platforms.
+    """
+    settings = Settings() if settings is None else settings
+    if points < settings.neighbors + 1:
+        raise ValueError(
+            f"points: got {points}, wanted at least {settings.neighbors + 1}, as each point has "
+            f"{settings.neighbors} neighbors"
+        )
+    unknown = [name for name in platforms if name not in PLATFORMS]
+    if unknown or not platforms:
+        raise ValueError(
+            f"platforms: got {', '.join(unknown) or 'none'}, wanted some of {', '.join(PLATFORMS)}"
+        )
+
+    def program(
+        source: Float[Array, "n c"],
+        source_count: Int32[Array, ""],
+        target: Float[Array, "n c"],
+        target_count: Int32[Array, ""],
+    ) -> dict[str, Array]:
+        clouds = [
+            prepare(cloud, mask=jnp.arange(points) < count, settings=settings)
+            for cloud, count in ((source, source_count), (target, target_count))
+        ]
+        found = register(params, *clouds, settings=settings)
+        return {name: getattr(found, name) for name in OUTPUTS}
+
+    front = jax_export.symbolic_shape("pairs") if batch else ()
+    cloud = jax.ShapeDtypeStruct((*front, points, 6 if normals else 3), jnp.float32)
+    count = jax.ShapeDtypeStruct(front, jnp.int32)
+    exporter = jax_export.export(
+        jax.jit(jax.vmap(program) if batch else program), platforms=tuple(platforms)
+    )
+    return exporter(cloud, count, cloud, count)
+
+
+def save_exported(path: str | os.PathLike[str], exported: jax_export.Exported) -> None:
+    """Writes the program, beside and then renamed."""
+    write_atomically(path, bytes(exported.serialize()))
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportedRegister:
+    """An exported program, ready to be called with clouds of any size up to its capacity."""
+
+    exported: jax_export.Exported
+
+    @property
+    def capacity(self) -> int:
+        """Most points of a cloud."""
+        return self.exported.in_avals[0].shape[-2]
+
+    @property
+    def channels(self) -> int:
+        """3, or 6 if clouds come with their normals."""
+        return self.exported.in_avals[0].shape[-1]
+
+    @property
+    def platforms(self) -> tuple[str, ...]:
+        """Where it runs."""
+        return tuple(self.exported.platforms)
+
+    def __call__(self, source: ArrayLike, target: ArrayLike) -> dict[str, Array]:
+        """Registers one pair, (n, channels) and (m, channels) and of unit size, as `register` does;
+        "weights" and "covered" have the length of the clouds. Raises ValueError for clouds that do
+        not fit the program."""
+        arguments = [part for cloud in self._padded(source, target) for part in cloud]
+        batched = len(self.exported.in_avals[0].shape) == 3
+        if batched:
+            arguments = [argument[None] for argument in arguments]
+        found = self.exported.call(*arguments)
+        if batched:
+            found = {name: value[0] for name, value in found.items()}
+        found["weights"] = found["weights"][: len(source)]
+        found["covered"] = found["covered"][: len(target)]
+        return found
+
+    def _padded(self, *clouds):
+        for name, cloud in zip(("source", "target"), clouds, strict=True):
+            cloud = np.asarray(cloud, np.float32)
+            if cloud.ndim != 2 or cloud.shape[1] != self.channels or len(cloud) < 3:
+                raise ValueError(f"{name}: got shape {cloud.shape}, wanted (n, {self.channels})")
+            if len(cloud) > self.capacity:
+                raise ValueError(
+                    f"{name}: got {len(cloud)} points, and the program was exported for at most "
+                    f"{self.capacity}"
+                )
+            if not np.isfinite(cloud).all():
+                raise ValueError(f"{name}: holds values that are not finite")
+            padded = np.pad(cloud, ((0, self.capacity - len(cloud)), (0, 0)))
+            yield jnp.asarray(padded), jnp.asarray(len(cloud), jnp.int32)
+
+
+def load_exported(path: str | os.PathLike[str]) -> ExportedRegister:
+    """What `save_exported` (or `cfr export`) wrote. Raises ValueError for other files."""
+    content = bytearray(Path(path).read_bytes())
+    try:
+        exported = jax_export.deserialize(content)
+    except Exception as error:  # flatbuffers reads past the end, or finds nonsense
+        raise ValueError(f"{path}: is no exported program: {type(error).__name__}") from error
+    if len(exported.in_avals) != 4:
+        raise ValueError(f"{path}: is an exported program, and not one of `register`")
+    return ExportedRegister(exported)

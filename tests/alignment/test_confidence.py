@@ -1,0 +1,163 @@
+"""The clues of an answer, and the probabilities made of them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import solids
+
+from benchmarks import fit_confidence, reliability
+from cfr_jax.alignment import confidence
+from cfr_jax.alignment.confidence import Clues, gather, of_alignment
+from cfr_jax.alignment.quality import Quality
+from cfr_jax.networks import calibration
+from cfr_jax.networks.clues import NetworkClues, of_network, of_registration
+
+OF_NETWORK = [field.name for field in dataclasses.fields(NetworkClues)]
+OF_SURFACES = [field.name for field in dataclasses.fields(Clues) if field.name != "network"]
+NAMES = OF_NETWORK + OF_SURFACES
+POINTS = solids.lopsided(40, 0).points
+
+
+def clues(**changes):
+    return dict.fromkeys(NAMES, 0.0) | changes
+
+
+def seen(degrees, *, shrunk=1.0, off=0.0, weights=None, mask=None):
+    """Clues of a registration whose iterations are turned by `degrees`, and whose match puts the
+    points where the last says, but `shrunk` about their center and `off`."""
+    transforms = np.stack([solids.motion(angle) for angle in degrees])
+    weights = np.full(len(POINTS), 0.5) if weights is None else weights
+    center = np.average(POINTS, axis=0, weights=weights)
+    targets = solids.move(transforms[-1], center + shrunk * (POINTS - center)) + [off, 0, 0]
+    arrays = (transforms, POINTS, targets, weights, weights)
+    arrays = [jnp.asarray(array, jnp.float32) for array in arrays]
+    return of_network(*arrays, mask, mask)
+
+
+def test_the_network_tells_how_it_came_to_its_answer():
+    found = seen([10, 25, 27])
+
+    np.testing.assert_allclose(found.settled, np.log(2 + 0.1), rtol=1e-3)
+    np.testing.assert_allclose(found.settling, np.log(15 + 0.1), rtol=1e-3)
+    np.testing.assert_allclose(found.source_found, 0.5, rtol=1e-6)
+
+
+def test_the_residual_is_the_distance_of_matched_places():
+    np.testing.assert_allclose(
+        [seen([10], off=off).residual for off in (0.0, 0.2)],
+        np.log(np.hypot(0.01, [0, 0.2])),
+        atol=1e-3,
+    )
+
+
+def test_an_undecided_match_points_to_the_middle_and_is_less_sharp():
+    sharp, blurred = seen([10]), seen([10], shrunk=0.5)
+
+    np.testing.assert_allclose(sharp.sharpness, 0, atol=1e-4)
+    np.testing.assert_allclose(blurred.sharpness, np.log(0.5), atol=1e-2)
+    assert blurred.residual > sharp.residual
+
+
+def test_the_lever_is_that_of_the_two_smaller_eigenvalues():
+    weights = np.random.default_rng(0).random(len(POINTS))
+
+    found = seen([0], weights=weights)
+
+    low, middle, high = np.linalg.eigvalsh(np.cov(POINTS.T, aweights=weights, ddof=0))
+    wanted = (low * middle + low * high + middle * high) / (low + middle + high)
+    np.testing.assert_allclose(found.lever, np.log(wanted) / 2, atol=1e-2)
+
+
+def test_padding_is_no_clue():
+    weights = np.arange(len(POINTS)) / 100
+    mask = jnp.arange(len(POINTS)) < 30
+
+    found = seen([10, 20], weights=weights, mask=mask)
+
+    wanted = weights[:30].mean()
+    np.testing.assert_allclose([found.source_found, found.target_found], wanted, rtol=1e-5)
+
+
+def test_a_single_iteration_counts_as_settled_and_has_finite_slopes():
+    found = seen([30])
+
+    np.testing.assert_allclose([found.settled, found.settling], np.log(0.1), atol=1e-2)
+
+    def probability(transforms):
+        arrays = (transforms, *map(jnp.float32, (POINTS, POINTS)), *[jnp.full(40, 0.5)] * 2)
+        return of_registration(of_network(*arrays))
+
+    slopes = jax.grad(probability)(jnp.eye(4)[None])
+    assert np.isfinite(slopes).all()
+
+
+def test_the_surfaces_tell_how_far_refining_went_and_how_the_answer_is_held():
+    quality = Quality(
+        fitness=jnp.array(0.75),
+        inlier_rmse=jnp.array(0.02),
+        resistance=jnp.array([0.25, 0.09, 0.5]),
+        weakest=jnp.eye(6)[:3],
+        overlap=jnp.array(0.8),
+        moments=jnp.eye(4),
+    )
+    answers = (jnp.asarray(solids.motion(angle), jnp.float32) for angle in (27, 32))
+
+    found = confidence.named(gather(seen([27]), *answers, quality))
+
+    assert sorted(found) == sorted(NAMES) and found["fitness"] == 0.75
+    np.testing.assert_allclose(found["agreement"], np.log(5 + 0.1), rtol=1e-3)
+    np.testing.assert_allclose([found["distance"], found["resistance"]], [0.4, 0.3], rtol=1e-6)
+
+
+def test_the_probability_is_the_logistic_of_the_weighted_clues(monkeypatch):
+    monkeypatch.setattr(calibration, "ALIGN", {"bias": -1.0, "fitness": 2.0, "settled": -0.5})
+
+    found = of_alignment(clues(fitness=0.75, settled=1.5))
+
+    assert found == pytest.approx(1 / (1 + np.exp(0.25)))
+
+
+@pytest.mark.parametrize("value", [-1e30, 1e30])
+def test_extreme_clues_give_a_probability(monkeypatch, value):
+    monkeypatch.setattr(calibration, "ALIGN", {"bias": 0.0, "fitness": 1.0})
+
+    found = of_alignment(clues(fitness=value))
+
+    assert found == pytest.approx(float(value > 0), abs=1e-9) and 0 <= found <= 1
+
+
+def test_what_ships_knows_its_clues_and_trusts_a_better_answer_more():
+    assert set(calibration.REGISTER) == {"bias", *OF_NETWORK}
+    assert set(calibration.ALIGN) == {"bias", *NAMES}
+
+    low = of_alignment(clues(distance=0.8, residual=-1.5, resistance=0.1))
+    high = of_alignment(clues(distance=0.4, residual=-2.5, resistance=0.5))
+    sure = of_registration(seen([10, 20, 20]))
+    unsure = of_registration(seen([10, 20, 60], off=0.2))
+
+    assert 0 <= low < high <= 1 and 0 <= unsure < sure <= 1
+
+
+# --- how it is fitted and measured ---
+
+
+def test_the_fit_finds_the_coefficients_that_made_the_answers():
+    rng = np.random.default_rng(0)
+    told = rng.normal(size=(20_000, 2)) * [1, 5] + [3, 0]
+    right = rng.random(len(told)) < 1 / (1 + np.exp(-(told @ [1.0, -0.2] - 2)))
+
+    np.testing.assert_allclose(fit_confidence.fit(told, right), [1.0, -0.2, -2], atol=0.15)
+
+
+def test_a_true_probability_is_calibrated_and_a_bold_one_is_not():
+    rng = np.random.default_rng(0)
+    chance = rng.random(20_000)
+    right = rng.random(len(chance)) < chance
+
+    assert reliability.calibration_error(chance, right) < 0.02
+    assert reliability.calibration_error(np.round(chance), right) == pytest.approx(0.25, abs=0.02)
+    # of two uniform chances the right one is the larger with probability 5 / 6
+    assert reliability.ranking(chance[:2000], right[:2000]) == pytest.approx(5 / 6, abs=0.02)

@@ -1,0 +1,175 @@
+"""The command `evaluate.py`, as a user runs it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from cfr_jax.evaluation.methods import methods_of
+
+ROOT = Path(__file__).parents[2]
+ABLATIONS = ROOT / "configs" / "eval_ablations.py"
+CONFIGS = sorted(set((ROOT / "configs").glob("eval_*.py")) - {ABLATIONS})
+
+
+def evaluate(*arguments: object) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, ROOT / "evaluate.py", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+
+
+def read_config(path: Path):
+    return read_module(path).get_config()
+
+
+def read_module(path: Path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def arguments(tmp_path_factory):
+    path = tmp_path_factory.mktemp("corpus") / "test.h5"
+    rng = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        points = rng.normal(size=(6, 1200, 3))
+        points /= np.linalg.norm(points, axis=2, keepdims=True)
+        file["data"] = (points * [1, 0.7, 0.5]).astype(np.float32)
+        file["normal"] = points.astype(np.float32)
+        file["label"] = np.zeros(6, np.uint8)
+    return (
+        f"--config={ROOT / 'configs' / 'eval_open_cad.py'}",
+        f"--config.data.path={path}",
+        "--methods=identity,truth",
+        "--config.threads=1",
+    )
+
+
+def test_the_same_seed_gives_the_same_table_whatever_draws_at_random(arguments, tmp_path):
+    arguments = [a for a in arguments if not a.startswith(("--methods", "--config.threads"))]
+    methods = "--methods=icp,icp_plane,gicp,gicp_jax,fgr,fgr_icp,ransac,kiss_matcher,cfr_align"
+
+    runs = [
+        evaluate(*arguments, methods, "--limit=2", f"--out={tmp_path / name}", "--noplots")
+        for name in "ab"
+    ]
+
+    tables = [(tmp_path / name / "table.md").read_text().split("## Time")[0] for name in "ab"]
+    assert tables[0] == tables[1], runs[1].stderr
+    assert tables[0].count("| cfr_align |") >= 2
+    found = [json.loads((tmp_path / name / "results.json").read_text()) for name in "ab"]
+    for name, method in found[0]["methods"].items():
+        for pair, again in zip(method["pairs"], found[1]["methods"][name]["pairs"], strict=True):
+            assert pair["transforms"] == again["transforms"], name
+
+
+def test_it_writes_table_results_plots_and_gallery_and_repeats_itself(arguments, tmp_path):
+    # when
+    first = evaluate(*arguments, "--limit=4", f"--out={tmp_path / 'a'}")
+    second = evaluate(*arguments, "--limit=4", f"--out={tmp_path / 'b'}", "--noplots")
+
+    # then
+    assert first.returncode == 0, first.stderr
+    tables = [(tmp_path / run / "table.md").read_text() for run in "ab"]
+    assert tables[0] in first.stdout
+    assert tables[0].split("## Time")[0] == tables[1].split("## Time")[0], second.stderr
+    truth = next(line for line in tables[0].splitlines() if line.startswith("| truth"))
+    assert truth.split("|")[2:6] == [" 0.00 ", " 0.00 ", " 0.0000 ", " 0.0000 "]
+    results = json.loads((tmp_path / "a" / "results.json").read_text())
+    identity = results["methods"]["identity"]
+    assert [pair["index"] for pair in identity["pairs"]] == [0, 1, 2, 3]
+    assert identity["numbers"]["err_r_mean"]["value"] > 10
+    assert identity["started"]["threads"] == 1
+    assert (tmp_path / "a" / "gallery" / "identity.png").is_file()
+    assert not (tmp_path / "b" / "gallery").exists()
+
+
+def test_missing_data_and_unknown_methods_are_told_in_a_line(arguments, tmp_path):
+    missing = evaluate(*arguments, "--config.data.path=/nowhere.h5", f"--out={tmp_path}")
+    unknown = evaluate(*arguments, "--methods=magic", f"--out={tmp_path}")
+    for run, told in ((missing, "no corpus at /nowhere.h5"), (unknown, "magic not in the config")):
+        assert run.returncode == 1
+        assert told in run.stderr
+        assert "Traceback" not in run.stderr
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_every_config_names_methods_that_exist(path):
+    config = read_config(path)
+    made = methods_of(config, [], seed=0)
+    wanted = {"identity", "truth", "icp", "fgr", "ransac", "gicp", "cfr", "rpmnet", "rpmnet_optim"}
+    assert wanted <= {m.name for m in made}
+    assert len(config.thresholds) == 3
+    assert tuple(config.main_threshold) in [tuple(pair) for pair in config.thresholds]
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_no_config_gives_a_baseline_an_option_that_it_does_not_take(path):
+    import inspect
+
+    from cfr_jax.evaluation.baselines import NAMES, baseline
+
+    for name, entry in read_config(path).methods.to_dict().items():
+        if entry["use"] not in NAMES:
+            continue
+        taken = inspect.signature(baseline(entry["use"])).parameters
+        if any(p.kind is p.VAR_KEYWORD for p in taken.values()):
+            taken = {**taken, **inspect.signature(baseline("fgr")).parameters}
+        options = set(entry.get("options", {}))
+        assert options <= set(taken), name
+        needed = {k for k, p in taken.items() if p.default is p.empty} - {"source", "target"}
+        assert needed - {"options"} <= options, name
+
+
+def test_without_normals_the_methods_are_the_same_and_none_is_given_any():
+    config = read_module(ROOT / "configs" / "eval_open_cad.py")
+    exact, estimated = (
+        config.get_config(kind).methods.to_dict() for kind in ("exact", "estimated")
+    )
+
+    # all but those that take no normals, and RPM-Net, whose answers are those of `rpmnet_optim`
+    without = {"identity", "truth", "icp", "gicp", "kiss_matcher", "rpmnet"}
+    assert set(estimated) == {f"{name}_estimated" for name in set(exact) - without}
+    for name, entry in estimated.items():
+        assert entry["estimated_normals"] is True
+        assert entry["use"] == exact[name.removesuffix("_estimated")]["use"]
+    assert not any(entry.get("estimated_normals") for entry in exact.values())
+    assert len(methods_of(config.get_config("estimated"), [], seed=0)) == len(estimated)
+
+
+def test_what_an_ablation_trains_is_what_it_measures():
+    from cfr_jax.evaluation.network import make_network
+    from cfr_jax.training.learner import learner
+
+    evaluations, trainings = read_module(ABLATIONS), read_module(ROOT / "configs" / "ablations.py")
+    for name, variants in evaluations.ABLATIONS.items():
+        config = evaluations.get_config(name)
+        assert len(config.methods) == len(variants) == 2
+        for method, (run, settings) in variants.items():
+            entry = config.methods[method].to_dict()
+            made = make_network(network="cfr", weights="object", **entry["options"])
+            measured = made.args[1].settings
+            if run:
+                assert entry["weights"] == f"{config.runs}/{run}/weights.safetensors"
+                assert learner(trainings.get_config(run)).validated == measured, method
+            for field, value in settings.items():
+                assert getattr(measured, field) == value
+
+
+def test_an_ablation_that_does_not_exist_is_told_in_a_line():
+    command = [sys.executable, ROOT / "ablate.py", "--ablation=luck"]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 1
+    assert "no ablation 'luck': weights, passes" in run.stderr and "Traceback" not in run.stderr

@@ -1,0 +1,102 @@
+"""Jacobi eigenvectors against LAPACK, and the derivative of the least direction."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cfr_jax.geometry.eigen import _SWEEPS, least_direction, symmetric_eigen
+
+least_slope = jax.jit(jax.jacrev(least_direction))
+solve = jax.jit(jax.vmap(symmetric_eigen))
+
+
+def symmetric(rng, values, count=50):
+    """Matrices with the given eigenvalues and random eigenvectors."""
+    basis = np.linalg.qr(rng.normal(size=(count, len(values), len(values))))[0]
+    return np.einsum("bij,j,bkj->bik", basis, values, basis).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        (3.0, 2.0, 1.0),
+        (1.0, 1.0, 0.2),
+        (1.0, 0.2, 0.2),
+        (1.0, 1.0, 1.0),
+        (1.0, 0.0, 0.0),
+        (1.0, 1.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (2.0, -1.0, -2.0),
+        (1.0, 1e-4, 1e-6),
+        (1.0, -1.0, -1.0, 1.0),
+        (3.0, 1e-3, -2.0, -1.0),
+        (1.0, 1.0, 1.0, -3.0),
+    ],
+)
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_eigenvectors_rebuild_the_matrix(values, scale):
+    matrices = symmetric(np.random.default_rng(0), np.array(values)) * np.float32(scale)
+
+    found, vectors = solve(jnp.asarray(matrices))
+
+    rebuilt = np.einsum("bij,bj,bkj->bik", vectors, found, vectors)
+    np.testing.assert_allclose(rebuilt, matrices, atol=3e-6 * scale)
+    identity = np.broadcast_to(np.eye(len(values)), rebuilt.shape)
+    np.testing.assert_allclose(
+        np.einsum("bji,bjk->bik", vectors, vectors), identity, rtol=0, atol=3e-6
+    )
+    wanted = np.broadcast_to(np.sort(values) * scale, found.shape)
+    np.testing.assert_allclose(np.sort(found, axis=1), wanted, atol=3e-6 * scale)
+
+
+@pytest.mark.parametrize("size", [3, 4])
+def test_the_last_sweep_no_longer_changes_a_float32_result(size, monkeypatch):
+    rng = np.random.default_rng(1)
+    matrices = rng.normal(size=(500, size, size)).astype(np.float32)
+    matrices = jnp.asarray(matrices + matrices.transpose(0, 2, 1))
+
+    values, _ = solve(matrices)
+    monkeypatch.setattr("cfr_jax.geometry.eigen._SWEEPS", _SWEEPS - 1)
+    earlier, _ = jax.jit(jax.vmap(lambda m: symmetric_eigen(m)))(matrices)
+
+    np.testing.assert_allclose(values, earlier, rtol=0, atol=1e-5)
+
+
+def test_the_least_direction_is_that_of_lapack():
+    rng = np.random.default_rng(2)
+    factors = rng.normal(size=(100, 5, 3)).astype(np.float32)
+    covariances = factors.transpose(0, 2, 1) @ factors
+
+    found = jax.jit(jax.vmap(least_direction))(jnp.asarray(covariances))
+
+    wanted = np.linalg.eigh(covariances.astype(np.float64))[1][..., 0]
+    np.testing.assert_allclose(np.abs(np.sum(found * wanted, axis=1)), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_the_least_direction_has_its_finite_differences_as_derivative(x64, scale):
+    rng = np.random.default_rng(3)
+    factor = rng.normal(size=(5, 3))
+    covariance = jnp.asarray(factor.T @ factor) * scale
+    change = rng.normal(size=(3, 3))
+    change = jnp.asarray(change + change.T) * scale
+    step = 1e-6
+
+    least = jax.jit(least_direction)
+    _, derivative = jax.jvp(least, (covariance,), (change,))
+
+    ahead, behind = (least(covariance + sign * step * change) for sign in (1, -1))
+    np.testing.assert_allclose(derivative, (ahead - behind) / (2 * step), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "diagonal", [(0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 1, 1), (1e-30, 1e-30, 1e-30), (1e30, 1, 1)]
+)
+def test_the_least_direction_has_a_finite_derivative_everywhere(diagonal):
+    covariance = jnp.diag(jnp.array(diagonal, jnp.float32))
+
+    gradient = least_slope(covariance)
+
+    assert np.isfinite(gradient).all()
+    np.testing.assert_allclose(np.linalg.norm(least_direction(covariance)), 1, atol=1e-6)

@@ -1,0 +1,63 @@
+"""A batch of clouds: in turn on a CPU, side by side elsewhere, the same answers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cfr_jax.networks.extraction import pooled_features
+from cfr_jax.networks.layers import Layer
+from cfr_jax.runtime.vectorizing import cloud_by_cloud
+
+
+def parts(weights, rows):
+    """Two results, one of them a tuple, as the heavy functions have."""
+    return jnp.tanh(rows @ weights["kernel"]), (weights["shift"] + rows.sum(0),)
+
+
+WEIGHTS = {"kernel": jnp.arange(12.0).reshape(3, 4) / 12, "shift": jnp.array([1.0, 2.0, 3.0])}
+ROWS = jnp.asarray(np.random.default_rng(0).normal(size=(5, 6, 3)), jnp.float32)
+
+
+@pytest.mark.parametrize("axes", [(None, 0), ({"kernel": None, "shift": 0}, 0), (None, 1)])
+def test_a_batch_in_turn_is_a_batch(axes):
+    weights = dict(WEIGHTS)
+    rows = jnp.moveaxis(ROWS, 0, axes[1])
+    if axes[0] is not None:
+        weights["shift"] = jnp.stack([WEIGHTS["shift"] * i for i in range(5)])
+
+    found = jax.vmap(cloud_by_cloud(parts), axes)(weights, rows)
+
+    wanted = jax.vmap(parts, axes)(weights, rows)
+    assert jax.tree.structure(found) == jax.tree.structure(wanted)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def test_only_a_cpu_takes_a_batch_in_turn():
+    batch = jax.jit(jax.vmap(cloud_by_cloud(parts), (None, 0)))
+
+    def loops(platform):
+        lowered = batch.trace(WEIGHTS, ROWS).lower(lowering_platforms=(platform,))
+        return "stablehlo.while" in lowered.as_text()
+
+    assert loops("cpu") and not loops("cuda") and not loops("tpu")
+
+
+def test_batched_features_have_the_gradients_of_each_cloud():
+    rng = np.random.default_rng(1)
+    draw = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)  # noqa: E731
+    layers = tuple(Layer(draw(i, 8), draw(8), draw(8), draw(8)) for i in (7, 8, 8))
+    clouds = draw(3, 10, 4, 7)
+
+    def score(layers, raw):
+        return jnp.sum(jnp.sin(pooled_features(layers, raw, groups=2)))
+
+    def together(layers):
+        return jnp.sum(jax.vmap(score, (None, 0))(layers, clouds))
+
+    found = jax.jit(jax.grad(together))(layers)
+
+    each = [jax.jit(jax.grad(score))(layers, raw) for raw in clouds]
+    for a, *b in zip(*map(jax.tree.leaves, (found, *each)), strict=True):
+        np.testing.assert_allclose(a, sum(b), atol=1e-4)

@@ -1,0 +1,101 @@
+"""The same functions lower for GPUs and TPUs, here, without either: no program that only a CPU has,
+and full precision wherever geometry is computed."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from cfr_jax.alignment.solving import solve_pair
+from cfr_jax.networks.cfr.modules import CHANNELS, init_params
+from cfr_jax.networks.cfr.registration import Settings, encode, register
+from cfr_jax.networks.sinkhorn import Form
+
+N, M, K, L = 40, 48, 8, 2
+PLATFORMS = ("cuda", "tpu")
+# widths of learned layers, whose products may be rounded as the platform likes
+LEARNED = {CHANNELS, 64, 128, 256, 512, 1024}
+
+
+def shape(*sizes, dtype=jnp.float32):
+    return jax.ShapeDtypeStruct(sizes, dtype)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return jax.eval_shape(lambda: init_params(jax.random.key(0), L))
+
+
+def registering(params, form: Form):
+    settings = Settings(neighbors=K, match=form)
+    return jax.jit(lambda p, x, y: register(p, x, y, settings=settings)), (
+        params, shape(N, 3), shape(M, 3),
+    )  # fmt: skip
+
+
+def training(params):
+    settings = Settings(neighbors=K, match="streamed")
+
+    def loss(params, x, y):
+        return jnp.sum(register(params, x, y, settings=settings).transform)
+
+    return jax.jit(jax.grad(loss)), (params, shape(N, 6), shape(M, 6))
+
+
+def aligning(params):
+    def cloud(n):
+        return {"points": shape(n, 3), "neighbors": shape(n, K, dtype=jnp.int32),
+                "mask": shape(n, dtype=bool)}  # fmt: skip
+
+    return jax.jit(lambda *a: solve_pair(*a, refine=True)), (params, cloud(N), cloud(M))
+
+
+PROGRAMS = {
+    "register, dense": lambda params: registering(params, "dense"),
+    "register, streamed": lambda params: registering(params, "streamed"),
+    "encode": lambda params: (jax.jit(encode), (params, shape(M, 6))),
+    "gradient": training,
+    "align": aligning,
+}
+
+
+def lowered(params, name, platform):
+    program, arguments = PROGRAMS[name](params)
+    return program.trace(*arguments).lower(lowering_platforms=(platform,)).as_text()
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_nothing_that_only_a_cpu_has_is_called(params, name, platform):
+    text = lowered(params, name, platform)
+
+    called = set(re.findall(r"custom_call @([\w.$]+)", text))
+    assert not {name for name in called if re.search("lapack|callback|cpu|ynn|onednn", name)}
+    # what is left are the libraries of the platform: eigenvalues and solutions of 6 x 6 systems
+    known = {"cuda": "cusolver|cublas|cu_lu|Eigh|getrf", "tpu": "Eigh|LuDecomposition|Qr|tpu"}
+    marks = "Sharding|annotate|optimization|mhlo|shape_assertion"
+    assert not {n for n in called if not re.search(f"{known[platform]}|{marks}", n)}
+
+
+@pytest.mark.parametrize("name", ["register, dense", "register, streamed", "gradient"])
+def test_distances_and_matches_are_computed_at_full_precision(params, name):
+    """On recent GPUs and on TPUs a product of float32 is rounded to ten bits or fewer, unless said
+    otherwise."""
+    text = lowered(params, name, "cuda")
+
+    found = 0
+    for line in text.splitlines():
+        if "stablehlo.dot_general" not in line:
+            continue
+        operands, result = re.search(r": \((.*)\) -> tensor<([^>]*)>", line).groups()
+        sizes = [tuple(map(int, re.findall(r"\d+(?=x)", part)))
+                 for part in (*re.findall(r"tensor<([^>]*)>", operands), result)]  # fmt: skip
+        # the block of affinities, made or read; and what gives the motion: 3 x 3
+        geometric = any(N in s and M in s for s in sizes) or sizes[-1] == (3, 3)
+        if geometric:
+            found += 1
+            assert line.count("HIGHEST") == 2, line
+        else:
+            assert LEARNED & set(sum(sizes, ())) or line.count("HIGHEST") == 2, line
+    assert found >= 2 * L

@@ -1,0 +1,75 @@
+"""The site builds without a warning: links within it lead somewhere, names in it exist."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+pytest.importorskip("sphinx", reason="the site needs the docs extra")
+pytest.importorskip("furo", reason="the site needs the docs extra")
+pytest.importorskip("myst_parser", reason="the site needs the docs extra")
+
+
+class Links(HTMLParser):
+    """Where a page leads, what it loads, and the places in it."""
+
+    def __init__(self, page: Path):
+        super().__init__()
+        self.leads, self.loads, self.places = [], [], set()
+        self.feed(page.read_text("utf-8"))
+
+    def handle_starttag(self, tag, attributes):
+        given = dict(attributes)
+        if given.get("id"):
+            self.places.add(given["id"])
+        if tag == "a" and given.get("href"):
+            self.leads.append(given["href"])
+        loaded = given.get("src") or (given.get("href") if tag == "link" else None)
+        if loaded and given.get("rel") not in ("index", "search", "next", "prev", "canonical"):
+            self.loads.append(loaded)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> dict[Path, Links]:
+    """The pages of the site, built with warnings as errors."""
+    out = tmp_path_factory.mktemp("site")
+    sphinx = [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", "-q"]
+    child = subprocess.run([*sphinx, "docs", str(out)], cwd=ROOT, capture_output=True, text=True)
+    assert child.returncode == 0, child.stderr
+    return {page: Links(page) for page in out.rglob("*.html")}
+
+
+def test_every_link_within_the_site_leads_to_a_place_that_is_there(site):
+    for page, links in site.items():
+        for lead in links.leads:
+            parts = urlsplit(lead)
+            if parts.scheme:
+                continue
+            goal = (page.parent / unquote(parts.path)).resolve() if parts.path else page
+            assert goal.exists(), f"{page.name}: {lead}"
+            if parts.fragment and goal in site:
+                assert unquote(parts.fragment) in site[goal].places, f"{page.name}: {lead}"
+
+
+def test_the_site_loads_nothing_from_elsewhere(site):
+    for page, links in site.items():
+        for loaded in links.loads:
+            assert urlsplit(loaded).scheme in ("", "data"), f"{page.name}: {loaded}"
+
+
+def test_the_answers_to_what_users_ask_are_all_there():
+    text = (ROOT / "docs" / "comparison.md").read_text("utf-8")
+    table = text.partition("| asked for |")[2]
+    rows = [line for line in table.splitlines()[2:] if line.startswith("|")]
+    assert len(rows) == 12
+    for row in rows:
+        shown = row.rstrip("| ").rpartition("|")[2]
+        assert re.fullmatch(r" `cfr [^`]+`", shown), row

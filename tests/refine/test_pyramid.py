@@ -1,0 +1,76 @@
+"""Refinement on all points: as exact as many points allow, never worse than what it was given."""
+
+import numpy as np
+import pytest
+import solids
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from cfr_jax.alignment import pyramid
+from cfr_jax.io import PointCloud
+
+TRUTH = solids.motion(20, (1.0, 2.0, 3.0), (0.1, -0.05, 0.2))
+
+
+def cloud(count, seed, *, moved=False, normals=False, noise=0.002):
+    points, given = solids.lopsided(count, seed, noise)
+    points = points - 0.4
+    if moved:  # the source: the truth maps it back
+        inverse = np.linalg.inv(TRUTH)
+        points, given = solids.move(inverse, points), given @ inverse[:3, :3].T
+    return PointCloud(points, given if normals else None)
+
+
+def off(transform):
+    """Degrees and length by which a motion misses the truth."""
+    left = np.linalg.inv(TRUTH) @ transform
+    turned = Rotation.from_matrix(left[:3, :3]).magnitude()
+    return np.degrees(turned), np.linalg.norm(left[:3, 3])
+
+
+START = TRUTH @ solids.motion(1.0, (1.0, -1.0, 0.5), (0.01, 0.0, -0.01))
+
+
+@pytest.mark.parametrize("normals", [False, True], ids=["estimated", "given"])
+def test_many_points_give_an_exact_answer(normals):
+    source = cloud(3000, 0, moved=True, normals=normals)
+    target = cloud(3000, 1, normals=normals)
+
+    fine = pyramid.refine(source, target, START, thinned_to=100)
+
+    degrees, length = off(fine.transform)
+    assert degrees < 0.1 and length < 1e-3  # from a degree and a hundredth
+    assert fine.improved and fine.converged
+
+
+def test_fitness_and_error_are_those_of_all_points():
+    source, target = cloud(3000, 0, moved=True), cloud(2500, 1)
+
+    fine = pyramid.refine(source, target, START, thinned_to=100)
+
+    distance = cKDTree(target.points).query(solids.move(fine.transform, source.points))[0]
+    near = distance < pyramid.DISTANCE
+    np.testing.assert_allclose(fine.fitness, near.mean())
+    np.testing.assert_allclose(fine.inlier_rmse, np.sqrt((distance[near] ** 2).mean()), rtol=1e-3)
+
+
+def test_part_of_the_points_in_another_place_do_not_pull():
+    source, target = cloud(3000, 0, moved=True), cloud(3000, 1)
+    kept = target.points[:, 0] < np.quantile(target.points[:, 0], 0.7)
+    target = PointCloud(np.concatenate([target.points[kept], target.points[~kept] + 0.3]))
+
+    degrees, length = off(pyramid.refine(source, target, START, thinned_to=100).transform)
+
+    assert degrees < 0.2 and length < 3e-3
+
+
+@pytest.mark.parametrize("away", [0.0, 5.0], ids=["the same points twice", "nothing near"])
+def test_what_cannot_be_made_better_is_kept(away):
+    target = cloud(1000, 1, noise=0.0)
+    source = PointCloud(solids.move(np.linalg.inv(TRUTH), target.points + [away, 0, 0]))
+
+    fine = pyramid.refine(source, target, TRUTH, thinned_to=100)
+
+    assert np.isfinite(fine.transform).all()
+    np.testing.assert_allclose(fine.transform, TRUTH, atol=1e-5)
+    assert fine.fitness == (0.0 if away else 1.0)

@@ -1,0 +1,146 @@
+"""Weights on disk: what was saved comes back, and nothing else does."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from cfr_jax.networks import rpmnet
+from cfr_jax.networks.cfr.modules import init_params
+from cfr_jax.weights import files as weights
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    return jax.jit(init_params, static_argnums=1)(jax.random.key(0), 2)
+
+
+@pytest.fixture
+def saved(fresh, tmp_path):
+    path = tmp_path / "mine.safetensors"
+    weights.save_params(path, fresh, {"made_by": "a test", "corpus": "none"})
+    return path
+
+
+def test_what_is_saved_comes_back_with_its_notes(fresh, saved):
+    found = weights.read_weights(saved)
+
+    assert jax.tree.structure(found.params) == jax.tree.structure(fresh)
+    for a, b in zip(jax.tree.leaves(found.params), jax.tree.leaves(fresh), strict=True):
+        assert a.dtype == jnp.float32
+        np.testing.assert_array_equal(a, b)
+    assert found.notes == {"made_by": "a test", "corpus": "none"}
+    assert found.name == "mine" and len(found.sha256) == 64
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, weights.load_params(str(saved)), fresh))
+    assert [path.name for path in saved.parent.iterdir()] == ["mine.safetensors"]
+
+
+def test_the_same_weights_have_the_same_digest_and_others_another(fresh, saved, tmp_path):
+    other = tmp_path / "other.safetensors"
+    digest = weights.read_weights(saved).sha256
+
+    weights.save_params(other, fresh, {"corpus": "none", "made_by": "a test"})
+    assert weights.read_weights(other).sha256 == digest
+
+    weights.save_params(other, jax.tree.map(lambda leaf: leaf * 2, fresh), {"made_by": "a test"})
+    assert weights.read_weights(other).sha256 != digest
+
+
+def test_any_flipped_bit_is_noticed(saved):
+    content = bytearray(saved.read_bytes())
+    header = 8 + int.from_bytes(content[:8], "little")
+    rng = np.random.default_rng(0)
+    places = [*rng.integers(0, header, 150), *rng.integers(header, len(content), 350)]
+
+    for place in places:
+        bit = 1 << int(rng.integers(8))
+        content[place] ^= bit
+        saved.write_bytes(content)
+        with pytest.raises(ValueError, match="^weights: "):
+            weights.read_weights(saved)
+        content[place] ^= bit
+
+    saved.write_bytes(content)
+    weights.read_weights(saved)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.9999])
+def test_a_truncated_file_is_refused(saved, share):
+    content = saved.read_bytes()
+    saved.write_bytes(content[: int(share * len(content))])
+
+    with pytest.raises(ValueError, match="no readable safetensors file"):
+        weights.read_weights(saved)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda tree: tree["cascade"].pop("bias"), "cascade/bias is missing"),
+        (lambda tree: tree.update(extra=np.zeros(3)), "extra is .*, wanted no such tensor"),
+        (lambda tree: tree["features"].update(bias_0=np.zeros(95, np.float32)), "features/bias_0"),
+        (lambda tree: tree["features"].update(bias_0=np.zeros(96)), "bias_0 is float64"),
+    ],
+)
+def test_another_network_is_refused(fresh, tmp_path, change, told):
+    tree = jax.tree.map(np.asarray, fresh)
+    change(tree)
+    weights.save_params(tmp_path / "other.safetensors", tree)
+
+    with pytest.raises(ValueError, match=f"^weights: .*{told}"):
+        weights.read_weights(tmp_path / "other.safetensors")
+
+
+def test_a_file_knows_which_network_it_holds(fresh, saved, tmp_path):
+    # given weights of the two networks
+    other = tmp_path / "other.safetensors"
+    weights.save_params(other, jax.jit(rpmnet.init_params)(jax.random.key(0)))
+
+    # then each is read for what it is
+    assert weights.read_weights(saved).network == weights.network_of(fresh) == "cfr"
+    assert weights.read_weights(other).network == "rpmnet"
+    assert weights.network_of(weights.load_params(other, "rpmnet")) == "rpmnet"
+    with pytest.raises(ValueError, match="other.* holds the network RPM-Net, wanted CFR$"):
+        weights.load_params(other)
+    with pytest.raises(ValueError, match="mine.* holds the network CFR, wanted RPM-Net$"):
+        weights.load_params(saved, "rpmnet")
+
+
+def test_weights_with_a_shared_layer_come_back(tmp_path):
+    path = tmp_path / "shared.safetensors"
+    weights.save_params(
+        path, jax.jit(init_params, static_argnums=(1, 2))(jax.random.key(0), 3, True)
+    )
+    assert weights.load_params(path)["cascade"]["kernel"].shape == (1, 96, 96)
+
+
+def test_a_file_of_someone_else_is_refused(saved, tmp_path):
+    path = tmp_path / "theirs.safetensors"
+    save_file(load_file(saved), path)
+
+    with pytest.raises(ValueError, match="carries no digest"):
+        weights.read_weights(path)
+
+
+def test_an_unknown_name_tells_what_ships():
+    with pytest.raises(ValueError, match="no file and no shipped weights called 'nowhere'"):
+        weights.read_weights("nowhere")
+
+
+def test_a_failed_save_leaves_nothing_behind(saved):
+    before = saved.read_bytes()
+
+    with pytest.raises(Exception, match="."):
+        weights.save_params(saved, {"a": object()})
+
+    assert saved.read_bytes() == before
+    assert [path.name for path in saved.parent.iterdir()] == ["mine.safetensors"]
+
+
+def test_every_shipped_file_is_sound():
+    for name in weights.shipped():
+        found = weights.read_weights(name)
+
+        assert found.name == name
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found.params))
