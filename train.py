@@ -42,8 +42,7 @@ def main(_) -> None:
     import jax
 
     from cfr_jax.cli.shared.cache import keep_compiled_programs
-    from cfr_jax.training import devices, loop, stopping, validation
-    from cfr_jax.training.reporting import record
+    from cfr_jax.training import devices, identity, loop, stopping, validation
 
     # orbax writes pages about a full disk; what went wrong is said below, once
     logging.set_verbosity(logging.FATAL)
@@ -65,7 +64,7 @@ def main(_) -> None:
         print(f"train.py: {stopped}", file=sys.stderr)
         sys.exit(128 + stopped.signal)
     if devices.is_first():
-        made = workdir / record.WEIGHTS
+        made = workdir / identity.WEIGHTS
         print(f"best at step {best['step']}: {validation.in_words(best)}")
         print(f"weights: {made}; the whole run: {workdir / 'summary.html'}")
         print(f"to use them: cfr register a.ply b.ply --weights {made}")

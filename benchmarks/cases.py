@@ -185,7 +185,7 @@ def networks(count: int) -> Iterator[Case]:
     """Our RPM-Net, as published and optimized, fresh parameters: time does not depend on them."""
     params = rpmnet.init_params(jax.random.key(0))
     for name, optimized in (("RPM-Net (Optim), ours", True), ("RPM-Net as published, ours", False)):
-        settings = rpmnet.Settings(optimized=optimized)
+        settings = rpmnet.RPMNetSettings(optimized=optimized)
 
         def make(settings=settings):
             return compiled(

@@ -24,11 +24,11 @@ import optax
 
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.corpus import Corpus
-from cfr_jax.data.drawing import ShapeSource, batch_at
+from cfr_jax.data.loader import ShapeSource, batch_at
 from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.networks.cfr import modules as network
 from cfr_jax.networks.cfr.iterations import unroll
-from cfr_jax.networks.clouds import Cloud, Settings
+from cfr_jax.networks.inputs import Cloud, Settings
 from cfr_jax.networks.layers import apply_layer
 from cfr_jax.training import devices, optimizers, step
 from cfr_jax.training.losses import pair_loss

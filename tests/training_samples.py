@@ -7,14 +7,14 @@ import jax
 import numpy as np
 from ml_collections import ConfigDict
 
-from cfr_jax.networks import clouds as prepared
+from cfr_jax.networks import inputs
 from cfr_jax.networks.cfr import iterations
 from cfr_jax.networks.cfr import modules as network
 from cfr_jax.training import devices, step
 from cfr_jax.training.optimizers import make_optimizer, make_schedule
 
 POINTS, NEIGHBORS, BATCH, STEPS, MAX_SKIPPED = 24, 6, 2, 16, 3
-SETTINGS = prepared.Settings(neighbors=NEIGHBORS, detach_motion=True)
+SETTINGS = inputs.Settings(neighbors=NEIGHBORS, detach_motion=True)
 
 
 @functools.cache

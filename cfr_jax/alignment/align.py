@@ -15,8 +15,7 @@ from cfr_jax.alignment import pyramid, search, solving
 from cfr_jax.alignment.answers import Alignment, answer
 from cfr_jax.alignment.planning import planned, read_clouds, rigid_motions
 from cfr_jax.alignment.second_look import look_again
-from cfr_jax.evaluation.baselines import gicp
-from cfr_jax.refine import generalized_icp
+from cfr_jax.refine import generalized_icp, small_gicp
 from cfr_jax.runtime.optional import require
 from cfr_jax.weights.files import load_params
 
@@ -104,7 +103,7 @@ def _by_small_gicp(plan, clouds, solved, seconds):
     )
     start = np.asarray(solved.transform, np.float64)
     cuts = tuple(stage.cut for stage in generalized_icp.STAGES)
-    found = gicp.descend(source, target, start, cuts)
+    found = small_gicp.descend(source, target, start, cuts)
     seconds["run"] += time.perf_counter() - began
     told = jnp.asarray(found.motion, jnp.float32), jnp.array(found.converged)
     return solving.timed(

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from cfr_jax.geometry import units
 from cfr_jax.io import PointCloud, as_point_cloud
-from cfr_jax.networks.clouds import Settings
+from cfr_jax.networks.inputs import Settings
 
 DEFAULT_BUDGET = 1024
 SETTINGS = Settings()

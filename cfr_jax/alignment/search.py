@@ -23,7 +23,7 @@ from cfr_jax.alignment.solving import on_device, surface, timed
 from cfr_jax.geometry import rigid, units
 from cfr_jax.geometry.rotations import cover
 from cfr_jax.networks.cfr.registration import encode, register
-from cfr_jax.networks.clouds import Settings, moved_by, prepare
+from cfr_jax.networks.inputs import Settings, moved_by, prepare
 from cfr_jax.refine import generalized_icp
 from cfr_jax.runtime import programs
 

@@ -21,8 +21,8 @@ from cfr_jax.alignment.planning import CASCADES, SETTINGS
 from cfr_jax.geometry.units import UnitCloud
 from cfr_jax.networks.cfr.iterations import Encoded
 from cfr_jax.networks.cfr.registration import Registration, encode, register
-from cfr_jax.networks.clouds import Cloud, prepare
 from cfr_jax.networks.clues import NetworkClues
+from cfr_jax.networks.inputs import Cloud, prepare
 from cfr_jax.refine import generalized_icp
 from cfr_jax.refine.generalized_icp import Surface, score
 from cfr_jax.runtime import programs

@@ -20,7 +20,7 @@ from cfr_jax.batch.memo import Memo
 from cfr_jax.geometry.units import UnitCloud
 from cfr_jax.networks.cfr.iterations import Encoded
 from cfr_jax.networks.cfr.registration import encode
-from cfr_jax.networks.clouds import prepare
+from cfr_jax.networks.inputs import prepare
 from cfr_jax.runtime import programs
 
 _KEPT = 32  # encoded targets, about 2 MB each

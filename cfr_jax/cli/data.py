@@ -147,7 +147,7 @@ def _open_cad(args: argparse.Namespace) -> int:
 
     import json
 
-    from cfr_jax.data.making.comparison import compare
+    from cfr_jax.data.making.difference import compare
     from cfr_jax.data.making.open_cad import build_open_cad
 
     _print_report(build_open_cad(args.out, args.debs), args.out)

@@ -17,8 +17,8 @@ from cfr_jax.evaluation.datasets import read_pairs
 from cfr_jax.evaluation.drawing.tables import Numbers, write_table
 from cfr_jax.evaluation.measuring import Measured, measure, only, summarize
 from cfr_jax.evaluation.methods import methods_of
-from cfr_jax.evaluation.records import Records
 from cfr_jax.evaluation.running import run_method
+from cfr_jax.evaluation.store import Records
 from cfr_jax.evaluation.symmetry import nearly_symmetric
 from cfr_jax.runtime.atomic import write_atomically
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.baselines import NAMES, baseline
-from cfr_jax.evaluation.records import code_digest
+from cfr_jax.evaluation.store import code_digest
 from cfr_jax.io import PointCloud
 from cfr_jax.io.cloud import usable_normals
 
@@ -33,7 +33,7 @@ _OURS = (
     "networks/**/*.py",
     "refine/*.py",
     "runtime/*.py",
-    "weights/files.py",
+    "weights/*.py",
     "evaluation/modules.py",
     "evaluation/network.py",
 )

@@ -22,8 +22,8 @@ from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks import rpmnet
 from cfr_jax.networks.cfr.iterations import bind, iterations_of
-from cfr_jax.networks.clouds import Cloud, Settings
 from cfr_jax.networks.features import raw_features
+from cfr_jax.networks.inputs import Cloud, Settings
 from cfr_jax.networks.sinkhorn import Affinity, match
 from cfr_jax.weights.files import load_params
 
@@ -47,7 +47,7 @@ def make_modules(
     """What tells the seconds of each module, for every pair given to it."""
     params = load_params(weights, network)
     if network == "rpmnet":
-        parts = _Rpmnet(params, rpmnet.Settings(**settings or {}))
+        parts = _Rpmnet(params, rpmnet.RPMNetSettings(**settings or {}))
     else:
         parts = _Cfr(params, Settings(**settings or {}))
     return lambda pairs: [seconds_of(parts.of(*_clouds(pair, estimated))) for pair in pairs]
@@ -99,7 +99,7 @@ class _Cfr:
 
 
 class _Rpmnet:
-    def __init__(self, params: dict, settings: rpmnet.Settings):
+    def __init__(self, params: dict, settings: rpmnet.RPMNetSettings):
         self.settings = settings
         network = rpmnet.bind(params)
         self.search = jax.jit(lambda cloud: rpmnet.find_neighbors(cloud, settings))

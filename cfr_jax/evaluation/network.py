@@ -24,7 +24,7 @@ from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks import rpmnet
 from cfr_jax.networks.cfr.iterations import Step, unroll
-from cfr_jax.networks.clouds import Cloud, Settings, moved_by
+from cfr_jax.networks.inputs import Cloud, Settings, moved_by
 from cfr_jax.refine import generalized_icp
 from cfr_jax.runtime import programs
 from cfr_jax.weights.files import load_params
@@ -32,7 +32,7 @@ from cfr_jax.weights.files import load_params
 Unroll = Callable[[dict, Cloud, Cloud, Any], Iterator[Step]]
 KINDS: dict[str, tuple[Unroll, Any]] = {
     "cfr": (unroll, Settings),
-    "rpmnet": (rpmnet.unroll, rpmnet.Settings),
+    "rpmnet": (rpmnet.unroll, rpmnet.RPMNetSettings),
 }
 """By name: its iterations, and the settings of these."""
 
@@ -172,7 +172,7 @@ def _stacked(program: Program, pairs: Sequence[Pair], estimated: bool) -> list[C
         if without and len(without) < len(clouds):
             raise ValueError("of one batch all clouds have normals or none; set batch to 1")
         k = min(settings.neighbors, len(points[0]) - 1)
-        if isinstance(settings, rpmnet.Settings) and not without:
+        if isinstance(settings, rpmnet.RPMNetSettings) and not without:
             found = [np.zeros((len(cloud), 1), np.int32) for cloud in points]  # it has its own
         else:
             found = [nearest_on_host(cloud, k, radius=settings.radius) for cloud in points]

@@ -12,9 +12,9 @@ import numpy as np
 from tqdm import tqdm
 
 from cfr_jax.data.pairs import Pair
-from cfr_jax.evaluation import machine, records
+from cfr_jax.evaluation import machine, store
 from cfr_jax.evaluation.methods import Answer, Method
-from cfr_jax.evaluation.records import Record, Records
+from cfr_jax.evaluation.store import Record, Records
 from cfr_jax.evaluation.worker import Failed, Missing, Worker
 
 _SAVE_EVERY = 5.0  # seconds
@@ -31,8 +31,8 @@ def run_method(method: Method, pairs: Sequence[Pair], path: Path, timeout: float
     if method.missing is not None:
         tqdm.write(f"{method.name} is left out: {method.missing}")
         return Records(method.about, missing=method.missing)
-    digests = [records.digest(pair) for pair in pairs]
-    held = records.load(path, method.about, digests)
+    digests = [store.digest(pair) for pair in pairs]
+    held = store.load(path, method.about, digests)
     # The method is not told the whole shapes.
     given = [dataclasses.replace(pair, clean_source=None, clean_target=None) for pair in pairs]
     todo = [index for index in range(len(pairs)) if index not in held.by_pair]
@@ -58,12 +58,12 @@ def run_method(method: Method, pairs: Sequence[Pair], path: Path, timeout: float
                 held.started = dataclasses.asdict(worker.started) | machine.stamp()
             bar.update(len(rows))
             if time.monotonic() - saved > _SAVE_EVERY:
-                records.save(path, held)
+                store.save(path, held)
                 saved = time.monotonic()
     held.by_pair = dict(sorted(held.by_pair.items()))
     if method.modules is not None and held.modules is None:
         held.modules = _time_modules(method, given[:_MODULE_PAIRS], timeout)
-    records.save(path, held)
+    store.save(path, held)
     return held
 
 

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from cfr_jax.data.pairs import Pair
-from cfr_jax.evaluation.records import code_digest
+from cfr_jax.evaluation.store import code_digest
 from cfr_jax.runtime.atomic import write_atomically
 
 LIMIT = 2.0

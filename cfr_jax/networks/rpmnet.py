@@ -20,9 +20,9 @@ from cfr_jax.geometry import rigid
 from cfr_jax.geometry.neighbors import first_in_ball
 from cfr_jax.networks.cfr.iterations import Step
 from cfr_jax.networks.cfr.modules import GROUPS, AnnealingNet, kernel_init, layer_of, unit_rows
-from cfr_jax.networks.clouds import Cloud, moved_by
 from cfr_jax.networks.extraction import pooled_features
 from cfr_jax.networks.features import raw_features
+from cfr_jax.networks.inputs import Cloud, moved_by
 from cfr_jax.networks.layers import apply_layer
 from cfr_jax.networks.sinkhorn import Affinity, match
 
@@ -32,7 +32,7 @@ _RAW_CHANNELS = 10
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class RPMNetSettings:
     """The published ones; tested with five iterations, trained with two."""
 
     neighbors: int = 64
@@ -78,7 +78,7 @@ def init_params(key: jax.Array) -> dict:
     return RPMNet().init(key, raw, points, points)["params"]
 
 
-def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> Iterator[Step]:
+def unroll(params: dict, source: Cloud, target: Cloud, settings: RPMNetSettings) -> Iterator[Step]:
     """The iterations, one by one; the clouds' `neighbors` are not used.
 
     As published, no gradient flows through the motion between two iterations.
@@ -113,7 +113,7 @@ def bind(params: dict) -> RPMNet:
     return RPMNet().bind({"params": params})
 
 
-def find_neighbors(cloud: Cloud, settings: Settings) -> Int32[Array, "n k"]:
+def find_neighbors(cloud: Cloud, settings: RPMNetSettings) -> Int32[Array, "n k"]:
     """The neighborhoods of a cloud where it is now."""
     return first_in_ball(
         lax.stop_gradient(cloud.points), settings.neighbors, settings.radius, cloud.mask

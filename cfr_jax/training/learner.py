@@ -8,12 +8,12 @@ from typing import Any
 
 import jax
 
-from cfr_jax.networks import clouds, rpmnet
+from cfr_jax.networks import inputs, rpmnet
 from cfr_jax.networks.cfr import iterations
 from cfr_jax.networks.cfr import modules as network
 from cfr_jax.training.step import Unroll
 
-AnySettings = clouds.Settings | rpmnet.Settings
+AnySettings = inputs.Settings | rpmnet.RPMNetSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +59,8 @@ def learner(config: Any) -> Learner:
                 key, config.iterations, config.get("shared", False)
             ),
             unroll=iterations.unroll,
-            trained=lambda count: clouds.Settings(neighbors=count, detach_motion=True, **changed),
-            validated=clouds.Settings(**changed),
+            trained=lambda count: inputs.Settings(neighbors=count, detach_motion=True, **changed),
+            validated=inputs.Settings(**changed),
         )
     if config.network == "rpmnet":
         if changed := dict(config.get("settings", {})):
@@ -68,14 +68,16 @@ def learner(config: Any) -> Learner:
         return Learner(
             fresh=rpmnet.init_params,
             unroll=rpmnet.unroll,
-            trained=lambda count: rpmnet.Settings(neighbors=count, iterations=config.iterations),
-            validated=rpmnet.Settings(),
+            trained=lambda count: rpmnet.RPMNetSettings(
+                neighbors=count, iterations=config.iterations
+            ),
+            validated=rpmnet.RPMNetSettings(),
         )
     raise ValueError(f"network: got {config.network!r}, wanted 'cfr' or 'rpmnet'")
 
 
 def _check_settings(changed: dict[str, Any]) -> None:
-    allowed = {field.name for field in dataclasses.fields(clouds.Settings)}
+    allowed = {field.name for field in dataclasses.fields(inputs.Settings)}
     allowed -= {"neighbors", "detach_motion"}  # those of the phases, and of all training
     if unknown := changed.keys() - allowed:
         raise ValueError(

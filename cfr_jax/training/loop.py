@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from cfr_jax.data.drawing import batches
-from cfr_jax.training import devices, step, stopping, validation
+from cfr_jax.data.loader import batches
+from cfr_jax.training import devices, identity, step, stopping, validation
 from cfr_jax.training.checkpoints import Checkpoints
 from cfr_jax.training.learner import Phase, remaining
-from cfr_jax.training.reporting import record
-from cfr_jax.training.reporting.reports import Reports
+from cfr_jax.training.reporting.reporter import Reporter
 from cfr_jax.training.step import TrainState
 from cfr_jax.training.task import Task, fresh_params, prepare
 from cfr_jax.weights import files as weights
@@ -38,13 +37,13 @@ def run(config: Any, workdir: Path) -> dict:
     state = devices.replicate(
         step.init_state(fresh_params(config, task.learner), task.optimizer), task.mesh
     )
-    about, told = record.begin(config, task.stamps), list(task.told)
+    about, told = identity.begin(config, task.stamps), list(task.told)
     with Checkpoints(workdir / "checkpoints", keep=config.keep_checkpoints) as checkpoints:
         restored = checkpoints.restore(state)
         if restored is not None:
             state, before = restored
-            told += record.go_on(before, about, task.steps, workdir)
-        with Reports(workdir, task, about) as reports:
+            told += identity.go_on(before, about, task.steps, workdir)
+        with Reporter(workdir, task, about) as reports:
             for line in told:
                 reports.say(line)
             _Training(config, workdir, task, state, about, checkpoints, reports).go_to_the_end()
@@ -61,7 +60,7 @@ class _Training:
     state: TrainState
     about: dict
     checkpoints: Checkpoints
-    reports: Reports
+    reports: Reporter
 
     def __post_init__(self):
         self._placed = validation.place(self.task.pairs, self.task.mesh)
@@ -152,8 +151,8 @@ class _Training:
             return
         self.reports.pause()
         self.checkpoints.wait()
-        file, notes = self.workdir / record.WEIGHTS, record.notes(self.config, self.about)
-        if devices.is_first() and not record.holds(file, self.about["best"]):
+        file, notes = self.workdir / identity.WEIGHTS, identity.notes(self.config, self.about)
+        if devices.is_first() and not identity.holds(file, self.about["best"]):
             weights.save_params(file, self.state.average, notes)
         self.reports.resume()
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from cfr_jax.geometry import rigid
 from cfr_jax.networks.cfr.iterations import Step
-from cfr_jax.networks.clouds import Cloud
+from cfr_jax.networks.inputs import Cloud
 
 _DISCOUNT = 0.5  # the last iteration counts fully, each one before it half of the next
 _INLIER_WEIGHT = 0.01

@@ -21,7 +21,7 @@ import numpy as np
 from cfr_jax.data import protocol
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.corpus import read_corpus
-from cfr_jax.data.drawing import Mixture, ShapeSource, Source
+from cfr_jax.data.loader import Mixture, ShapeSource, Source
 from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.runtime.progress import Progress

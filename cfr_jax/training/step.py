@@ -16,7 +16,7 @@ from jaxtyping import Array, Int
 
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks.cfr.iterations import Step
-from cfr_jax.networks.clouds import Cloud
+from cfr_jax.networks.inputs import Cloud
 from cfr_jax.training.devices import AXIS
 from cfr_jax.training.losses import PairLoss, pair_loss
 

@@ -12,7 +12,7 @@ import optax
 from jax.sharding import Mesh
 
 from cfr_jax.data.augment import Sampling
-from cfr_jax.data.drawing import Mixture
+from cfr_jax.data.loader import Mixture
 from cfr_jax.data.making.build import ENOUGH
 from cfr_jax.training import devices, optimizers, sources, step
 from cfr_jax.training.learner import Learner, Phase, learner

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float64, Int, UInt8
 
 from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.viewer.camera import Camera, best_view
 from cfr_jax.viewer.scene import Scene
-from cfr_jax.viewer.view import View, best_view
 
 INT16 = 32767
 UNUSED = 255  # weight byte of a point the network did not use; used ones are 0 … 254
@@ -72,13 +72,13 @@ def _json_for_html(value: dict[str, Any]) -> str:
     return text
 
 
-def _payload(scene: Scene, view: View, max_points: int) -> dict[str, Any]:
+def _payload(scene: Scene, camera: Camera, max_points: int) -> dict[str, Any]:
     """What page.html reads; lengths in units of `scale`, positions relative to the view's center.
 
     Large offsets (map coordinates) are removed here, in float64, so that the page may compute in
     float32.
     """
-    scale = float(view.radii[-1])
+    scale = float(camera.radii[-1])
     kept_source = _thin(len(scene.source), max_points, scene.weights)
     kept_target = _thin(len(scene.target), max_points, None)
     source_center, source = _quantize(scene.source[kept_source], scale)
@@ -94,7 +94,7 @@ def _payload(scene: Scene, view: View, max_points: int) -> dict[str, Any]:
             **target,
             "name": scene.target_name,
             "total": len(scene.target),
-            "position": ((target_center - view.center) / scale).tolist(),
+            "position": ((target_center - camera.center) / scale).tolist(),
         },
         "stations": [
             {
@@ -104,15 +104,15 @@ def _payload(scene: Scene, view: View, max_points: int) -> dict[str, Any]:
                 # Where the middle of the source lies: what moves evenly between two stations,
                 # whatever the distance of the cloud from its origin.
                 "position": (
-                    (transform[:3, :3] @ source_center + transform[:3, 3] - view.center) / scale
+                    (transform[:3, :3] @ source_center + transform[:3, 3] - camera.center) / scale
                 ).tolist(),
                 "radius": float(radius) / scale,
             }
             for label, transform, radius in zip(
-                scene.labels, scene.transforms, view.radii, strict=True
+                scene.labels, scene.transforms, camera.radii, strict=True
             )
         ],
-        "view": _quaternion(view.rotation).tolist(),
+        "view": _quaternion(camera.rotation).tolist(),
         "facts": list(scene.facts.items()),
         "warnings": list(scene.warnings),
     }

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.viewer.camera import best_view
 from cfr_jax.viewer.scene import Scene
-from cfr_jax.viewer.view import best_view
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

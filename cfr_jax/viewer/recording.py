@@ -5,9 +5,9 @@ import os
 import numpy as np
 
 from cfr_jax.runtime.atomic import unfinished
+from cfr_jax.viewer.camera import best_view
 from cfr_jax.viewer.picture import SOURCE, TARGET
 from cfr_jax.viewer.scene import Scene
-from cfr_jax.viewer.view import best_view
 
 PIXELS = 2.5  # diameter of a point
 

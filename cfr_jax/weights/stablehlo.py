@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int32
 from numpy.typing import ArrayLike
 
 from cfr_jax.networks.cfr.registration import register
-from cfr_jax.networks.clouds import Settings, prepare
+from cfr_jax.networks.inputs import Settings, prepare
 from cfr_jax.runtime.atomic import write_atomically
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")

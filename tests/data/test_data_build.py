@@ -5,7 +5,7 @@ import pytest
 from cfr_jax.data.corpus import read_corpus
 from cfr_jax.data.making import build as building
 from cfr_jax.data.making.build import build, choose_unseen, folder_items, split_of
-from cfr_jax.data.making.comparison import compare
+from cfr_jax.data.making.difference import compare
 from cfr_jax.data.making.samples import Item
 
 POINTS = 600

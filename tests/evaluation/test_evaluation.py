@@ -18,13 +18,13 @@ from ml_collections import ConfigDict
 from scipy.spatial.transform import Rotation
 
 from cfr_jax.data.pairs import Pair
-from cfr_jax.evaluation import records
+from cfr_jax.evaluation import store
 from cfr_jax.evaluation.datasets import nearest_motion, read_pairs
 from cfr_jax.evaluation.drawing.tables import write_table
 from cfr_jax.evaluation.measuring import measure, only, summarize
 from cfr_jax.evaluation.methods import Answer, Method, clouds_of, make_baseline, methods_of
-from cfr_jax.evaluation.records import Record, Records
 from cfr_jax.evaluation.running import run_method
+from cfr_jax.evaluation.store import Record, Records
 
 ABOUT = {"use": "identity", "options": {}, "estimated_normals": False, "batch": 1, "threads": 1}
 
@@ -51,7 +51,7 @@ def a_corpus(path, shapes: int = 4):
 
 def answers(pairs, transforms) -> Records:
     by_pair = {
-        k: Record(records.digest(pair), np.asarray(t)[None].tolist(), 0.5)
+        k: Record(store.digest(pair), np.asarray(t)[None].tolist(), 0.5)
         for k, (pair, t) in enumerate(zip(pairs, transforms, strict=True))
     }
     return Records(dict(ABOUT), by_pair=by_pair)
@@ -132,16 +132,16 @@ def test_a_run_goes_on_with_the_pairs_that_have_no_answer_yet(tmp_path):
 
 def test_answers_made_with_other_settings_do_not_count(tmp_path):
     path, pairs = tmp_path / "part.json", [a_pair()]
-    records.save(path, answers(pairs, [np.eye(4)]))
-    digests = [records.digest(pairs[0])]
-    assert len(records.load(path, dict(ABOUT), digests).by_pair) == 1
-    assert not records.load(path, ABOUT | {"options": {"distance": 1.0}}, digests).by_pair
+    store.save(path, answers(pairs, [np.eye(4)]))
+    digests = [store.digest(pairs[0])]
+    assert len(store.load(path, dict(ABOUT), digests).by_pair) == 1
+    assert not store.load(path, ABOUT | {"options": {"distance": 1.0}}, digests).by_pair
 
 
 def test_stored_answers_keep_every_digit(tmp_path):
     path, pair = tmp_path / "part.json", a_pair()
-    records.save(path, answers([pair], [pair.transform]))
-    kept = records.load(path, dict(ABOUT), [records.digest(pair)]).by_pair[0]
+    store.save(path, answers([pair], [pair.transform]))
+    kept = store.load(path, dict(ABOUT), [store.digest(pair)]).by_pair[0]
     np.testing.assert_array_equal(np.array(kept.transforms)[0], pair.transform)
 
 
@@ -150,7 +150,7 @@ def test_a_damaged_file_of_answers_is_refused(tmp_path, content):
     path = tmp_path / "part.json"
     path.write_text(content)
     with pytest.raises(ValueError, match="no file of results .*remove it"):
-        records.load(path, dict(ABOUT), [])
+        store.load(path, dict(ABOUT), [])
 
 
 def test_identity_and_truth_have_the_errors_that_they_must():
@@ -181,7 +181,7 @@ def test_a_failure_is_a_miss_and_no_part_of_the_mean_error():
     # given: solved, failed
     pairs = [a_pair(0), a_pair(1)]
     held = answers(pairs, [pair.transform for pair in pairs])
-    held.by_pair[1] = Record(records.digest(pairs[1]), failure="no luck")
+    held.by_pair[1] = Record(store.digest(pairs[1]), failure="no luck")
 
     # when
     measured = measure("half", held, pairs)
@@ -502,7 +502,7 @@ def test_rpmnet_answers_a_batch_as_each_pair_alone(tmp_path):
         clouds = (
             Cloud(jnp.float32(x), jnp.float32(ones), none) for x in (pair.source, pair.target)
         )
-        alone = motions(rpmnet.unroll, params, *clouds, rpmnet.Settings(**settings))
+        alone = motions(rpmnet.unroll, params, *clouds, rpmnet.RPMNetSettings(**settings))
         np.testing.assert_allclose(answer.transforms, alone, atol=2e-4)
 
 
@@ -531,7 +531,7 @@ def test_a_prepared_cloud_has_the_size_of_the_network_and_its_padding_changes_no
             (pair.target, frames.target_center),
         )
     ]
-    wanted = frames.to_caller(motions(rpmnet.unroll, params, *unit, rpmnet.Settings(**SMALL)))
+    wanted = frames.to_caller(motions(rpmnet.unroll, params, *unit, rpmnet.RPMNetSettings(**SMALL)))
     wanted[:, :3, 3] *= 1e3
     np.testing.assert_allclose(found.transforms[:, :3, :3], wanted[:, :3, :3], atol=2e-4)
     np.testing.assert_allclose(found.transforms[:, :3, 3], wanted[:, :3, 3], atol=1.0)
@@ -543,8 +543,7 @@ def test_the_modules_that_are_timed_are_those_of_a_registration(tmp_path, networ
 
     from cfr_jax.evaluation import modules
     from cfr_jax.geometry import rigid
-    from cfr_jax.networks import clouds as prepared
-    from cfr_jax.networks import rpmnet
+    from cfr_jax.networks import inputs, rpmnet
     from cfr_jax.networks.cfr import iterations
 
     # given the parts of a registration of one iteration
@@ -555,11 +554,11 @@ def test_the_modules_that_are_timed_are_those_of_a_registration(tmp_path, networ
         params["cascade"] = {name: leaf[:1] for name, leaf in params["cascade"].items()}
         out = params["annealing"]["out"]
         params["annealing"]["out"] = {name: leaf[..., [0, 5]] for name, leaf in out.items()}
-        small = prepared.Settings(**settings)
+        small = inputs.Settings(**settings)
         parts = modules._Cfr(params, small)
         (motion,) = motions(iterations.unroll, params, source, target, small)
     else:
-        small = rpmnet.Settings(**settings, iterations=1)
+        small = rpmnet.RPMNetSettings(**settings, iterations=1)
         parts = modules._Rpmnet(params, small)
         (motion,) = motions(rpmnet.unroll, params, source, target, small)
 
@@ -587,8 +586,7 @@ def test_each_module_is_counted_as_often_as_it_runs(
     from collections import Counter
 
     from cfr_jax.evaluation import modules
-    from cfr_jax.networks import clouds as prepared
-    from cfr_jax.networks import rpmnet
+    from cfr_jax.networks import inputs, rpmnet
 
     class Anything:  # a result that can be taken apart in every way
         def __getitem__(self, place):
@@ -599,7 +597,7 @@ def test_each_module_is_counted_as_often_as_it_runs(
 
     monkeypatch.setattr(modules.jax, "jit", lambda function, **_: lambda *_: Anything())
     _, params = a_network(tmp_path, network)
-    kind = {"cfr": prepared.Settings, "rpmnet": rpmnet.Settings}[network]
+    kind = {"cfr": inputs.Settings, "rpmnet": rpmnet.RPMNetSettings}[network]
     parts = {"cfr": modules._Cfr, "rpmnet": modules._Rpmnet}[network](params, kind(**settings))
     counted = Counter()
     for part in parts.of(*modules._clouds(a_pair(), estimated=True)):

@@ -10,7 +10,7 @@ from oracle import clouds
 
 from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.networks.cfr.registration import register
-from cfr_jax.networks.clouds import Settings, moved_by, prepare
+from cfr_jax.networks.inputs import Settings, moved_by, prepare
 
 N, M, K = 24, 28, 6
 SMALL = Settings(neighbors=K)

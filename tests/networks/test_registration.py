@@ -12,8 +12,8 @@ from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.networks.cfr import registration
 from cfr_jax.networks.cfr.iterations import bind
 from cfr_jax.networks.cfr.registration import encode, register
-from cfr_jax.networks.clouds import Settings, moved_by, prepare
 from cfr_jax.networks.features import raw_features
+from cfr_jax.networks.inputs import Settings, moved_by, prepare
 from cfr_jax.weights.authors import from_state_dict
 
 K = 16

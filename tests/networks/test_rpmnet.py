@@ -24,7 +24,7 @@ def test_it_answers_as_the_reference_in_both_forms(optimized):
         for points, normals in ((pair.x, pair.nx), (pair.y, pair.ny))
     )
 
-    settings = rpmnet.Settings(neighbors=20, iterations=2, optimized=optimized)
+    settings = rpmnet.RPMNetSettings(neighbors=20, iterations=2, optimized=optimized)
     steps = rpmnet.unroll(from_state_dict(state), source, target, settings)
     found = np.stack([step.transform for step in steps])
 

@@ -148,7 +148,7 @@ def test_padding_changes_nothing():
     np.testing.assert_allclose(found, wanted, atol=1e-5)
 
 
-def generalized_icp(source, target, initial, stage, rounds=40):
+def oracle_icp(source, target, initial, stage, rounds=40):
     """The fixed point, in float64, each round solved by scipy: pairs, weights and metric held."""
     transform, tree = np.array(initial, np.float64), cKDTree(target.points)
     for _ in range(rounds):
@@ -180,7 +180,7 @@ def test_it_ends_where_an_independent_minimizer_of_the_same_cost_does(thickness)
     stage = Stage(0.2, thickness)
     source, target = solids.lopsided(120, 0, 0.005), solids.lopsided(150, 1, 0.005)
     initial = solids.motion(3, translation=(0.02, 0, 0.01))
-    wanted = generalized_icp(source, target, initial, stage)
+    wanted = oracle_icp(source, target, initial, stage)
 
     # the same stage four times over: as many steps as it may need
     found = REFINE(

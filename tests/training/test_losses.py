@@ -9,7 +9,7 @@ import pytest
 from oracle import authors, cfr, clouds, pieces
 
 from cfr_jax.networks.cfr.iterations import unroll
-from cfr_jax.networks.clouds import Settings, prepare
+from cfr_jax.networks.inputs import Settings, prepare
 from cfr_jax.training.losses import correspondence_loss, pair_loss
 from cfr_jax.weights.authors import from_state_dict
 

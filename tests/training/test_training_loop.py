@@ -14,7 +14,7 @@ from cfr_jax.data.augment import Sampling
 from cfr_jax.training import devices, learner, loop, optimizers, step, stopping, validation
 from cfr_jax.training.checkpoints import Checkpoints, SaveError
 from cfr_jax.training.reporting.board import Board
-from cfr_jax.training.reporting.reports import Reports
+from cfr_jax.training.reporting.reporter import Reporter
 from cfr_jax.training.stopping import Stopped
 from cfr_jax.training.task import fresh_params, prepare
 from cfr_jax.weights import files as weights
@@ -336,14 +336,14 @@ def test_a_run_cut_short_before_its_first_validation_is_validated(
 
 
 def test_asked_to_stop_while_it_logs_it_saves_before_it_stops(corpus_file, tmp_path, monkeypatch):
-    measured = Reports.measured
+    measured = Reporter.measured
 
     def asked(self, done, skipped):
         measured(self, done, skipped)
         if done == 5:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr(Reports, "measured", asked)
+    monkeypatch.setattr(Reporter, "measured", asked)
     given = config(corpus_file)
     given.log_every, given.checkpoint_every, given.validate_every = 5, 100, 100
 

@@ -68,7 +68,7 @@ def test_a_journal_forgets_what_comes_after_the_step_it_goes_on_from(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"step": 1}\n{"step": 2}\n{"step": 3}\n{"step": 4, "lo')
 
-    journal = log.Journal(path, 2)
+    journal = log.MetricsLog(path, 2)
     journal.write({"step": 3, "again": True})
 
     assert log.read_journal(path) == [{"step": 1}, {"step": 2}, {"step": 3, "again": True}]
@@ -78,7 +78,7 @@ def test_a_journal_that_begins_anew_forgets_all(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"step": 0}\n{"step": 50}\n')  # killed before the first checkpoint
 
-    log.Journal(path, 0)
+    log.MetricsLog(path, 0)
 
     assert log.read_journal(path) == []
 
@@ -207,6 +207,6 @@ def test_the_bar_tells_loss_errors_speed_and_the_time_left():
 
 def test_lines_are_plain_json(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    log.Journal(path, 0).write(line(2))
+    log.MetricsLog(path, 0).write(line(2))
 
     assert json.loads(path.read_text())["loss"] == 1.5

@@ -12,7 +12,7 @@ from training_samples import BATCH, NEIGHBORS, POINTS, assert_same, fresh, recip
 
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.corpus import read_corpus
-from cfr_jax.data.drawing import ShapeSource, batch_at
+from cfr_jax.data.loader import ShapeSource, batch_at
 from cfr_jax.networks.cfr import iterations
 from cfr_jax.networks.cfr import modules as network
 from cfr_jax.training import devices
@@ -145,7 +145,9 @@ def products(jaxpr):
         if equation.primitive.name == "dot_general":
             files = [frame.file_name for frame in equation.source_info.traceback.frames]
             here = next(file for file in files if "/cfr_jax/" in file or "/flax/linen/" in file)
-            room = re.split("/cfr_jax/|/flax/linen/", here)[-1].split("/")[0]
+            room = (
+                re.split("/cfr_jax/|/flax/linen/", here)[-1].removeprefix("networks/").split("/")[0]
+            )
             yield room, equation.params["precision"]
         for inner in jaxprs_in_params(equation.params):
             yield from products(inner)

@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cfr_jax.viewer import Scene, write_page
+from cfr_jax.viewer.camera import best_view
 from cfr_jax.viewer.page import _quaternion
-from cfr_jax.viewer.view import best_view
 
 HOSTILE = [
     "</script><img src=x onerror=alert(1)>",

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cfr_jax.viewer import Scene, write_recording
-from cfr_jax.viewer.view import best_view
+from cfr_jax.viewer.camera import best_view
 
 
 def make_scene(offset=0.0):

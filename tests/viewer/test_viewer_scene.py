@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cfr_jax.viewer.camera import best_view
 from cfr_jax.viewer.scene import Scene
-from cfr_jax.viewer.view import best_view
 
 
 def motion(axis_angle=(0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0)):

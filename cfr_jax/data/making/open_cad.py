@@ -36,7 +36,7 @@ _PMD = ".dae.cached.pmd"
 
 
 @dataclass(frozen=True)
-class Source:
+class Origin:
     """A package, and the files in it that hold meshes."""
 
     package: str
@@ -46,25 +46,25 @@ class Source:
 
 
 SOURCES = (
-    Source(
+    Origin(
         "0ad-data",
         "0.0.26-1",
         r"mods/public/public\.zip$",
         "0 A.D., Wildfire Games, CC-BY-SA-3.0",
     ),
-    Source(
+    Origin(
         "flightgear-data-models",
         "1:2020.3.16+dfsg-1",
         r"flightgear/Models/.*\.ac$",
         "FlightGear, Curtis L. Olson and the FlightGear team, GPL-2+",
     ),
-    Source(
+    Origin(
         "flightgear-data-ai",
         "1:2020.3.16+dfsg-1",
         r"flightgear/AI/.*\.ac$",
         "FlightGear, Curtis L. Olson and the FlightGear team, GPL-2+",
     ),
-    Source(
+    Origin(
         "sweethome3d-furniture",
         "1.8-1",
         r"\.sh3f$",
@@ -118,7 +118,7 @@ def credits_text(versions: Mapping[str, str]) -> str:
 
 
 def unpack(
-    source: Source, work: Path, debs: Path | None, quiet: bool = False
+    source: Origin, work: Path, debs: Path | None, quiet: bool = False
 ) -> tuple[list[Path], str]:
     """The package's mesh files, unpacked into `work` (once: a second call finds them there), and
     its version."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from cfr_jax.evaluation.baselines.clouds import described, open3d_cloud
 from cfr_jax.evaluation.baselines.icp import descend
+from cfr_jax.evaluation.baselines.open3d_clouds import described, open3d_cloud
 from cfr_jax.io import PointCloud
 from cfr_jax.runtime.optional import require
 

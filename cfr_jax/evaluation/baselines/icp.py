@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from cfr_jax.evaluation.baselines.clouds import open3d_cloud
+from cfr_jax.evaluation.baselines.open3d_clouds import open3d_cloud
 from cfr_jax.evaluation.baselines.start import Start, initial
 from cfr_jax.io import PointCloud
 from cfr_jax.runtime.optional import require

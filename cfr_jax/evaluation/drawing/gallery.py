@@ -12,9 +12,9 @@ from jaxtyping import Float
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.drawing.figures import new_figure, save_figure
 from cfr_jax.evaluation.measuring import Measured
-from cfr_jax.evaluation.records import Records
+from cfr_jax.evaluation.store import Records
 from cfr_jax.viewer import Scene
-from cfr_jax.viewer.view import best_view
+from cfr_jax.viewer.camera import best_view
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

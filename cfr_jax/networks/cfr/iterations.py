@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 
 from cfr_jax.geometry import rigid
 from cfr_jax.networks.cfr.modules import CFR
-from cfr_jax.networks.clouds import Cloud, Settings, moved_by
 from cfr_jax.networks.features import raw_features
+from cfr_jax.networks.inputs import Cloud, Settings, moved_by
 from cfr_jax.networks.sinkhorn import Affinity, Match, match
 
 

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from cfr_jax.geometry import rigid
 from cfr_jax.networks.cfr.iterations import Encoded, encoded, iterate, iterations_of, moved_on
-from cfr_jax.networks.clouds import Cloud, Settings, check_points, prepare
 from cfr_jax.networks.clues import NetworkClues, of_network, of_registration
+from cfr_jax.networks.inputs import Cloud, Settings, check_points, prepare
 
 
 @struct.dataclass

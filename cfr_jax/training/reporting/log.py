@@ -62,7 +62,7 @@ def writing(path: Path) -> Iterator[None]:
         ) from error
 
 
-class Journal:
+class MetricsLog:
     """`metrics.jsonl`: an object a line, appended; read again when a run goes on."""
 
     def __init__(self, path: Path, step: int):

@@ -31,7 +31,7 @@ def test_a_batch_in_turn_is_a_batch(axes):
     wanted = jax.vmap(parts, axes)(weights, rows)
     assert jax.tree.structure(found) == jax.tree.structure(wanted)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-6)
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7)  # of entries of order one
 
 
 def test_only_a_cpu_takes_a_batch_in_turn():

@@ -13,7 +13,7 @@ from cfr_jax.training.devices import is_first
 from cfr_jax.training.learner import Phase
 from cfr_jax.training.losses import PairLoss
 from cfr_jax.training.reporting.board import Board
-from cfr_jax.training.reporting.log import Bar, Clock, Journal, read_journal, summarize
+from cfr_jax.training.reporting.log import Bar, Clock, MetricsLog, read_journal, summarize
 from cfr_jax.training.reporting.summary import write_summary
 from cfr_jax.training.stopping import Stopped
 from cfr_jax.training.task import Task
@@ -23,7 +23,7 @@ from cfr_jax.viewer.scene import Scene
 _PICTURES = 3  # validation pairs drawn for TensorBoard
 
 
-class Reports:
+class Reporter:
     """Bar, journal, TensorBoard and the page at the end.
 
     Measurements stay on the device until they are written. `clock` stands still between `pause`
@@ -39,12 +39,12 @@ class Reports:
         self._bar = Bar(task.steps, about["step"], shown=is_first())
         self._journal = self._board = None
         if is_first():
-            self._journal = Journal(workdir / "metrics.jsonl", about["step"])
+            self._journal = MetricsLog(workdir / "metrics.jsonl", about["step"])
             self._board = Board(workdir / "tensorboard", about["step"])
             if self._board.missing:
                 self._bar.say(self._board.missing)
 
-    def __enter__(self) -> Reports:
+    def __enter__(self) -> Reporter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

@@ -6,7 +6,7 @@ from oracle import pieces
 
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.corpus import Corpus
-from cfr_jax.data.drawing import Mixture, ShapeSource, batch_at, batches
+from cfr_jax.data.loader import Mixture, ShapeSource, batch_at, batches
 
 SMALL = Sampling(points=24, neighbors=6)
 

@@ -17,7 +17,7 @@ YAW = np.deg2rad(-28.0)
 
 
 @dataclass(frozen=True)
-class View:
+class Camera:
     """A camera without a lens.
 
     `rotation` (3, 3) has as rows the directions right, up and toward the viewer, in the target's
@@ -31,8 +31,8 @@ class View:
     radii: Float64[np.ndarray, " s"]
 
 
-def best_view(scene: Scene) -> View:
-    """View along the direction of least spread of the aligned clouds, tilted a little."""
+def best_view(scene: Scene) -> Camera:
+    """Camera along the direction of least spread of the aligned clouds, tilted a little."""
     together = np.concatenate([scene.target, scene.moved(-1)])
     low, high = np.quantile(together, [1 - INSIDE, INSIDE], axis=0)
     center = (low + high) / 2
@@ -41,7 +41,7 @@ def best_view(scene: Scene) -> View:
     # A single point, or all points in one place, still needs a frame of some size.
     radii = np.maximum(radii, max(1e-9, 1e-9 * np.abs(center).max())) * MARGIN
     rotation = _turn_x(PITCH) @ _turn_y(YAW) @ _principal_axes(together)
-    return View(rotation=rotation, center=center, radii=radii)
+    return Camera(rotation=rotation, center=center, radii=radii)
 
 
 def _reach(points: Float64[np.ndarray, "n 3"], center: Float64[np.ndarray, " 3"]) -> float:

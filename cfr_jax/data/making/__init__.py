@@ -1,0 +1,1 @@
+"""Builds corpora of shapes from meshes."""

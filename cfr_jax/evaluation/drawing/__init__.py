@@ -1,0 +1,1 @@
+"""Tables, plots and a gallery of what was measured."""

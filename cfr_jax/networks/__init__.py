@@ -1,0 +1,1 @@
+"""The learned networks, and the parts they are made of."""

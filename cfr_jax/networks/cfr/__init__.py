@@ -1,0 +1,1 @@
+"""Cascading feature extraction (Hisadome & Matsui, 2021)."""

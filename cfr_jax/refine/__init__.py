@@ -1,0 +1,1 @@
+"""Local refinement: a motion that is nearly right, made precise."""

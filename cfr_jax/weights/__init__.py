@@ -1,0 +1,1 @@
+"""Weights on disk: files, cards, the authors' checkpoints, exported programs."""
