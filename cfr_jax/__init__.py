@@ -8,38 +8,67 @@
 Names load on first use, so that importing the package (and `cfr --help`) does not import JAX.
 """
 
-import importlib
+from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
 
-_HOMES = {
-    "Alignment": "alignment.answers",
-    "align": "alignment.align",
-    "Outcome": "batch.stream",
-    "align_many": "batch.stream",
-    "Cloud": "networks.inputs",
-    "Encoded": "networks.cfr.iterations",
-    "Registration": "networks.cfr.registration",
-    "Settings": "networks.inputs",
-    "encode": "networks.cfr.registration",
-    "prepare": "networks.inputs",
-    "register": "networks.cfr.registration",
-    "load_params": "weights.files",
-    "save_params": "weights.files",
-    "CloudFileError": "io",
-    "PointCloud": "io",
-}
+__all__ = [
+    "Alignment",
+    "Cloud",
+    "CloudFileError",
+    "Encoded",
+    "Outcome",
+    "PointCloud",
+    "Registration",
+    "Settings",
+    "__version__",
+    "align",
+    "align_many",
+    "encode",
+    "load_params",
+    "prepare",
+    "register",
+    "save_params",
+]
 
-__all__ = ["__version__", *sorted(_HOMES)]
+# Type checkers read the imports; the program looks names up in the table. A test holds the two to
+# each other.
+if TYPE_CHECKING:
+    from cfr_jax.alignment.align import align
+    from cfr_jax.alignment.answers import Alignment
+    from cfr_jax.batch.stream import Outcome, align_many
+    from cfr_jax.io import CloudFileError, PointCloud
+    from cfr_jax.networks.cfr.iterations import Encoded
+    from cfr_jax.networks.cfr.registration import Registration, encode, register
+    from cfr_jax.networks.inputs import Cloud, Settings, prepare
+    from cfr_jax.weights.files import load_params, save_params
+else:
+    _HOMES = {
+        "Alignment": "alignment.answers",
+        "align": "alignment.align",
+        "Outcome": "batch.stream",
+        "align_many": "batch.stream",
+        "Cloud": "networks.inputs",
+        "Encoded": "networks.cfr.iterations",
+        "Registration": "networks.cfr.registration",
+        "Settings": "networks.inputs",
+        "encode": "networks.cfr.registration",
+        "prepare": "networks.inputs",
+        "register": "networks.cfr.registration",
+        "load_params": "weights.files",
+        "save_params": "weights.files",
+        "CloudFileError": "io",
+        "PointCloud": "io",
+    }
 
+    def __getattr__(name):
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        import importlib
 
-def __getattr__(name: str):
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
+        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+        globals()[name] = value
+        return value
 
-
-def __dir__():
-    return __all__
+    def __dir__():
+        return __all__

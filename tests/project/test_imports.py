@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ast
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -90,18 +88,3 @@ def inside():
     from cfr_jax.evaluation import metrics as t
 """
     assert imported_rooms(text) == {"geometry", "networks", "data", "evaluation"}
-
-
-def test_importing_the_package_imports_neither_jax_nor_numpy():
-    code = "import sys, cfr_jax; print(sorted({'jax', 'numpy', 'flax'} & set(sys.modules)))"
-    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
-    assert child.stdout.strip() == "[]", child.stderr
-
-
-def test_every_public_name_of_the_package_can_be_imported():
-    import cfr_jax
-
-    for name in cfr_jax.__all__:
-        assert getattr(cfr_jax, name) is not None
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = cfr_jax.nothing

@@ -1,0 +1,74 @@
+"""The public names: what loads them, and what type checkers know of them."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import cfr_jax
+
+ROOT = Path(__file__).parents[2]
+USE = """
+import numpy as np
+import cfr_jax as cfr
+reveal_type(cfr.align)
+reveal_type(cfr.register)
+reveal_type(cfr.align("a.ply", "b.ply").transform)
+reveal_type(cfr.load_params())
+for outcome in cfr.align_many([("a.ply", "b.ply")]):
+    reveal_type(outcome)
+cfr.algin("a")
+cfr.align("a.ply")
+"""
+
+
+def test_importing_the_package_imports_neither_jax_nor_numpy():
+    code = "import sys, cfr_jax; print(sorted({'jax', 'numpy', 'flax'} & set(sys.modules)))"
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert child.stdout.strip() == "[]", child.stderr
+
+
+def test_every_public_name_of_the_package_can_be_imported():
+    for name in cfr_jax.__all__:
+        assert getattr(cfr_jax, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = cfr_jax.nothing
+
+
+def test_type_checkers_see_the_names_that_load():
+    tree = ast.parse((ROOT / "cfr_jax" / "__init__.py").read_text("utf-8"))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    seen = {
+        alias.name: node.module.removeprefix("cfr_jax.")
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert seen == cfr_jax._HOMES
+    assert sorted(cfr_jax.__all__) == sorted([*seen, "__version__"])
+
+
+def test_a_type_checker_knows_the_public_functions_and_finds_mistakes(tmp_path):
+    pytest.importorskip("mypy")
+    (tmp_path / "use.py").write_text(USE)
+
+    child = subprocess.run(
+        [sys.executable, "-m", "mypy", "--config-file=", "--follow-imports=silent",
+         "--ignore-missing-imports", "--cache-dir", str(tmp_path), str(tmp_path / "use.py")],
+        capture_output=True, text=True, cwd=ROOT, timeout=600,
+    )  # fmt: skip
+
+    lines = [line.partition("use.py:")[2] for line in child.stdout.splitlines()]
+    told = {int(line.split(":")[0]): line for line in lines if line}
+    assert child.returncode == 1, child.stdout + child.stderr
+    assert "def (source: Any, target: Any" in told[4] and "Alignment" in told[4]
+    assert "Registration" in told[5]
+    assert "ndarray" in told[6]
+    assert "dict" in told[7]
+    assert "Outcome" in told[9]
+    assert 'no attribute "algin"' in told[10]
+    assert 'Missing positional argument "target"' in told[11]
