@@ -1,6 +1,7 @@
-# Every target makes .venv itself, from any Python 3.11 to 3.13; PYTHON=python3.12 chooses one.
+# Every target makes .venv itself, from any Python 3.11 to 3.14; PYTHON=python3.12 chooses one.
 #   make demo       register a real pair, and write a picture and a page into out/
-#   make test       the tests; make test-slow: those that take minutes
+#   make test       the tests
+#   make test-slow  what takes too long for every change: see .ci/nightly
 #   make lint       ruff and mypy
 #   make coverage   the tests, and how much of the package they reach
 #   make bench      measure speed; BENCH="--quick --minutes 8" for a short one
@@ -14,7 +15,7 @@ SHELL := /bin/bash
 PYTHON ?=
 BENCH ?=
 BIN := .venv/bin
-RUNNABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+RUNNABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 
 demo: .venv/.viz
 	$(BIN)/cfr demo
@@ -24,10 +25,10 @@ test: .venv/.dev
 	$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-slow: .venv/.dev
-	$(BIN)/python -m pytest -m slow
+	.ci/nightly
 
 coverage: .venv/.dev
-	$(BIN)/python -m pytest --cov --cov-report=term --cov-fail-under=90
+	$(BIN)/python -m pytest --cov --cov-report=term --cov-fail-under=92
 
 lint: .venv/.dev
 	$(BIN)/ruff check .
@@ -61,9 +62,9 @@ clean:
 
 # A shim of pyenv may be found and not run, a Debian Python may lack venv: try each one.
 .venv/bin/python:
-	@for python in $(or $(PYTHON),python3 python3.12 python3.13 python3.11 python); do \
+	@for python in $(or $(PYTHON),python3 python3.12 python3.13 python3.14 python3.11 python); do \
 	  if "$$python" -c '$(RUNNABLE)' 2>/dev/null; then exec "$$python" -m venv --clear .venv; fi; \
 	done; \
-	echo "no Python from 3.11 to 3.13 with venv found (tried: $(or $(PYTHON),python3 python3.11 python3.12 python3.13 python))." >&2; \
+	echo "no Python from 3.11 to 3.14 with venv found (tried: $(or $(PYTHON),python3 python3.11 python3.12 python3.13 python3.14 python))." >&2; \
 	echo "Debian and Ubuntu: apt-get install python3-venv. Elsewhere: make PYTHON=/path/to/python3.12" >&2; \
 	exit 1

@@ -7,12 +7,14 @@ import json
 import re
 import subprocess
 import sys
+import tarfile
 import tomllib
 import venv
 import zipfile
 from pathlib import Path
 
 import pytest
+from hatchling.builders.sdist import SdistBuilder
 from hatchling.builders.wheel import WheelBuilder
 
 import cfr_jax
@@ -141,11 +143,38 @@ def test_what_files_import_when_they_run_is_installed_by_a_dependency_or_an_extr
     assert needed <= requirement_names([*PROJECT["dependencies"], *offered])
 
 
-def test_every_requirement_has_a_lower_and_an_upper_bound():
+def test_every_requirement_has_a_lower_bound_and_no_cap():
+    """`.ci/nightly` installs the lowest versions stated, `.ci/run` the newest."""
     runtime = [PROJECT["dependencies"]]
     runtime += [value for key, value in PROJECT["optional-dependencies"].items() if key != "dev"]
     for requirement in (each for group in runtime for each in group):
-        assert re.search(r">=[\d.]+,<[\d.]+", requirement), requirement
+        assert re.match(r"[\w.-]+>=[\d.]+(;.*)?$", requirement), requirement
+
+
+def test_the_source_archive_holds_what_git_holds_of_it(tmp_path):
+    # given
+    tracked = subprocess.run(
+        ["git", "ls-files"], capture_output=True, text=True, check=True, cwd=ROOT
+    ).stdout.splitlines()
+    aside = (".ci/", ".gitignore")  # of the repository, not of what is published
+
+    # when
+    built = next(SdistBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"]))
+    with tarfile.open(built) as archive:
+        packed = {member.name.partition("/")[2] for member in archive if member.isfile()}
+
+    # then
+    assert packed - {"PKG-INFO", ".gitignore"} == {name for name in tracked if not name.startswith(aside)}
+
+
+def test_registering_imports_nothing_that_only_training_needs():
+    code = (
+        "import sys; from cfr_jax.cli import main; import numpy as np, cfr_jax as cfr\n"
+        "x = np.random.default_rng(0).normal(size=(80, 3)); cfr.align(x, x, refine=False)\n"
+        "print(sorted({'optax', 'orbax', 'ml_collections', 'h5py'} & set(sys.modules)))"
+    )
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert child.stdout.strip() == "[]", child.stdout + child.stderr
 
 
 def test_every_extra_that_a_message_names_exists():
