@@ -33,6 +33,7 @@ python_use_unqualified_type_names = True
 def setup(app):
     app.connect("autodoc-process-docstring", bars_stay_bars)
     app.connect("source-read", list_the_other_pages)
+    app.connect("source-read", list_the_public_names)
 
 
 def list_the_other_pages(app, name, source):
@@ -41,6 +42,22 @@ def list_the_other_pages(app, name, source):
         named = {line.strip() for line in source[0].splitlines()} | {"index"}
         others = "\n".join(sorted(app.env.found_docs - named))
         source[0] = source[0].replace("(the other pages)", others)
+
+
+def list_the_public_names(app, name, source):
+    """The reference documents every name of `cfr_jax.__all__`: in that order."""
+    if name == "api":
+        public = [each for each in cfr_jax.__all__ if not each.startswith("__")]
+        source[0] = source[0].replace("(the public names)", "\n".join(map(documented, public)))
+
+
+def documented(name):
+    value = getattr(cfr_jax, name)
+    if isinstance(value, type) and issubclass(value, Exception):
+        return f".. autoexception:: cfr_jax.{name}\n"
+    if isinstance(value, type):
+        return f".. autoclass:: cfr_jax.{name}\n   :members:\n"
+    return f".. autofunction:: cfr_jax.{name}\n"
 
 
 def bars_stay_bars(app, what, name, obj, options, lines):

@@ -31,7 +31,7 @@ class Outcome:
     """What became of one pair."""
 
     index: int
-    """Its place among the pairs given, from 0."""
+    """Position of the pair in the input, from 0."""
     alignment: Alignment | None
     error: str | None
     """Why there is no alignment."""
@@ -49,23 +49,23 @@ def align_many(
     workers: int | None = None,
     ordered: bool = True,
 ) -> Iterator[Outcome]:
-    """Aligns many pairs; yields one `Outcome` a pair, of which the generator is asked for.
+    """Aligns a stream of pairs and yields one `Outcome` for each.
 
-    A pair is `(source, target)` or `(source, target, initial)`, clouds as `align` takes them and
-    one (4, 4) start (a search of all rotations is for `align` alone), or a function without
-    arguments that returns one, to be called when it is its turn. Pairs are drawn, read and
-    made ready ahead of their turn by `workers` threads (default: the cores there are, up to 4);
-    those of one padded size are solved `batch` at a time (default: 1 on a CPU, 16 on an
-    accelerator) by one `vmap`ped program. A target that many sources share, as the same file or
-    with the same points, is read and encoded once as long as it is among the last ones used.
+    A pair is `(source, target)` or `(source, target, initial)`. Clouds are what `align` takes, and
+    `initial` is one (4, 4) start; a search of all rotations needs `align`. A pair may also be a
+    function without arguments that returns such a tuple; it is called when its turn comes.
 
-    With `ordered` the outcomes come in the order of the pairs, otherwise as they are done, which
-    holds none back. Answers are those of `align` up to the rounding of float32; a `second_look` is
-    taken pair by pair. A pair that cannot
-    be read or has no answer is an outcome with an `error`, and stops no other. Arrays given must
-    not be changed before their outcome has come.
+    `workers` threads read and prepare pairs ahead of time (default: one per core, at most 4). Pairs
+    of one padded size are solved together, `batch` at a time, by one `vmap` of the program
+    (default: 1 on a CPU, 16 on an accelerator). A target that several sources share, as the same
+    file or with the same points, is read and encoded once while it is among the last ones used.
 
-    Raises ValueError, before any pair is read, for options that are none.
+    With `ordered`, outcomes come in the order of the pairs. Otherwise they come as soon as they are
+    done. The answers equal those of `align` up to float32 rounding. A `second_look` runs pair by
+    pair. If a pair cannot be read or has no answer, its outcome has an `error`, and the others
+    continue. Do not change an array before its outcome has come.
+
+    Raises ValueError for invalid options, before it reads any pair.
     """
     budget = DEFAULT_BUDGET if max_points is None else whole("max_points", max_points, least=3)
     seed = whole("seed", seed, least=0)

@@ -11,6 +11,8 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
+import cfr_jax
+
 ROOT = Path(__file__).parents[2]
 
 pytest.importorskip("sphinx", reason="the site needs the docs extra")
@@ -57,6 +59,12 @@ def test_every_link_within_the_site_leads_to_a_place_that_is_there(site):
             assert goal.exists(), f"{page.name}: {lead}"
             if parts.fragment and goal in site:
                 assert unquote(parts.fragment) in site[goal].places, f"{page.name}: {lead}"
+
+
+def test_the_reference_has_every_public_name(site):
+    (page,) = (page for page in site if page.name == "api.html")
+    for name in cfr_jax.__all__:
+        assert name == "__version__" or f"cfr_jax.{name}" in site[page].places, name
 
 
 def test_the_site_loads_nothing_from_elsewhere(site):
