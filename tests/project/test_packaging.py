@@ -164,7 +164,9 @@ def test_the_source_archive_holds_what_git_holds_of_it(tmp_path):
         packed = {member.name.partition("/")[2] for member in archive if member.isfile()}
 
     # then
-    assert packed - {"PKG-INFO", ".gitignore"} == {name for name in tracked if not name.startswith(aside)}
+    assert packed - {"PKG-INFO", ".gitignore"} == {
+        name for name in tracked if not name.startswith(aside)
+    }
 
 
 def test_registering_imports_nothing_that_only_training_needs():
