@@ -22,6 +22,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from cfr_jax.geometry.motions import angle_between
+
 FLOP_OF_AN_ENTRY = 20 * 2 * 96  # sweeps, multiply and add, channels
 WHAT = ("register", "align", "align all points")
 
@@ -71,8 +73,7 @@ def measure(what: str, points: int) -> dict[str, float]:
         "align all points": lambda x, y: aligned(x, y, all_points=True),
     }[what]
     found = run(source, target)
-    left = np.asarray(found.pop("transform"), np.float64)[:3, :3].T @ truth[:3, :3]
-    error = math.degrees(math.acos(min(1.0, max(-1.0, (np.trace(left) - 1) / 2))))
+    error = float(angle_between(np.asarray(found.pop("transform"), np.float64), truth))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
     return {"points": points, "error": error, "peak": peak, **found}
 

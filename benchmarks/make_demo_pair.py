@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 
 from cfr_jax.data.making.furniture import FurnitureLibrary
 from cfr_jax.data.making.packages import extract
+from cfr_jax.geometry import motions
 from cfr_jax.io.mesh import Mesh
 
 PIECE = "Blend Swap CC-0#forkLift"
@@ -105,7 +106,7 @@ def sensor_pose(
 def scan(
     mesh: Mesh, pose: Float[np.ndarray, "4 4"], rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
-    surface = mesh.points(DENSE, int(rng.integers(1 << 31))).points @ pose[:3, :3].T + pose[:3, 3]
+    surface = motions.apply(pose, mesh.points(DENSE, int(rng.integers(1 << 31))).points)
     seen = np.flatnonzero(visible(surface))
     chosen = surface[rng.choice(seen, POINTS, replace=False)]
     return chosen + rng.normal(0.0, NOISE, chosen.shape)

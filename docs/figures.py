@@ -18,6 +18,7 @@ from cfr_jax import io
 from cfr_jax.alignment import align as alignment
 from cfr_jax.cli.shared.cache import keep_compiled_programs
 from cfr_jax.evaluation import metrics
+from cfr_jax.geometry import motions
 from cfr_jax.networks.cfr import iterations, registration
 
 IMAGES = Path(__file__).parent / "images"
@@ -119,7 +120,7 @@ def draw_iterations(path: Path, source, target, found, truth) -> None:
     flat = (target.points - middle) @ axes_of[:2].T
     for column, (label, transform) in enumerate(stations):
         axes = figure.add_axes((column / len(stations), 0.24, 1 / len(stations), 0.72))
-        moved = source.points @ transform[:3, :3].T + transform[:3, 3]
+        moved = motions.apply(transform, source.points)
         moved = (moved - middle) @ axes_of[:2].T
         both = np.concatenate([flat, moved])
         colors = np.repeat([TARGET, SOURCE], [len(flat), len(moved)], axis=0)
@@ -158,7 +159,7 @@ def unit_pair(source, target, found):
 def draw_match(path: Path, unit, steps) -> None:
     """The normalized affinities after iterations 1, 3 and 5, both clouds in one order."""
     last = steps[-1][0]
-    moved = unit[0] @ last[:3, :3].T + last[:3, 3]
+    moved = motions.apply(last, unit[0])
     _, _, axes_of = np.linalg.svd(unit[1] - unit[1].mean(axis=0), full_matrices=False)
     rows, columns = (np.argsort(part @ axes_of[0]) for part in (moved, unit[1]))
     shown = (0, 2, 4)

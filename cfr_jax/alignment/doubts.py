@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from cfr_jax.alignment import confidence
 from cfr_jax.alignment.planning import SETTINGS
+from cfr_jax.geometry import motions
 
 # Below this the fit hardly suffers when a cloud slides or turns. Of planes, spheres, cylinders,
 # cones and the like, sampled twice by 200 to 500 points with noise, 97% measured less along their
@@ -67,15 +68,10 @@ def turns(
     transform: Float[np.ndarray, "4 4"], others: Float[np.ndarray, "a 4 4"]
 ) -> tuple[str, ...]:
     """By which turns `others` differ from `transform`, about axes of the target's frame."""
-    if not len(others):
-        return ()
-    # imported here: half a second that most answers need not wait for
-    from scipy.spatial.transform import Rotation
-
     told = []
     for other in others:
-        turn = Rotation.from_matrix(other[:3, :3] @ transform[:3, :3].T).as_rotvec(degrees=True)
-        angle = float(np.linalg.norm(turn))
+        turn = motions.to_rotvec(other[:3, :3] @ transform[:3, :3].T)
+        angle = float(np.degrees(np.linalg.norm(turn)))
         told.append(f"turned by {angle:.0f}° about {direction(turn)}" if angle > 1 else "shifted")
     return tuple(told)
 

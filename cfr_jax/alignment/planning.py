@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from cfr_jax.geometry import units
+from cfr_jax.geometry import motions, units
 from cfr_jax.io import PointCloud, as_point_cloud
 from cfr_jax.networks.inputs import Settings
 
@@ -33,13 +33,13 @@ class Plan:
 
     def started_at(self, motion: Float[np.ndarray, "4 4"]) -> Plan:
         """The same clouds, the source moved by `motion` of unit clouds first."""
-        rotation, shift = motion[:3, :3], motion[:3, 3]
-        points = np.float32(self.source.points @ rotation.T + shift) * self.source.mask[:, None]
+        points = np.float32(motions.apply(motion, self.source.points))
+        points *= self.source.mask[:, None]
         normals = self.source.normals
         moved = dataclasses.replace(
             self.source,
             points=points,
-            normals=None if normals is None else np.float32(normals @ rotation.T),
+            normals=None if normals is None else np.float32(motions.rotate(motion, normals)),
         )
         frames = dataclasses.replace(
             self.frames,
@@ -74,10 +74,10 @@ def planned(
     """
     source, target = read_clouds(source, target)
     if initial is not None:
-        motions = rigid_motions(initial)
-        if len(motions) > 1:
-            raise ValueError(f"initial: got {len(motions)} motions, wanted one")
-        initial = motions[0]
+        given = rigid_motions(initial)
+        if len(given) > 1:
+            raise ValueError(f"initial: got {len(given)} motions, wanted one")
+        initial = given[0]
     budget = DEFAULT_BUDGET if max_points is None else whole("max_points", max_points, least=3)
     seed = whole("seed", seed, least=0)
     frames = units.unit_frames(source, target, initial)
@@ -110,24 +110,13 @@ def whole(name: str, value: Any, *, least: int) -> int:
 def rigid_motions(initial: Any) -> Float[np.ndarray, "k 4 4"]:
     """One or several initial motions, float64; raises ValueError for anything else."""
     try:
-        motions = np.asarray(initial, np.float64)
+        given = np.asarray(initial, np.float64)
     except (TypeError, ValueError):
         what = repr(initial) if isinstance(initial, str) else f"a {type(initial).__name__}"
         raise ValueError(
             f"initial: got {what} that is no array of numbers, "
             'wanted "global", a (4, 4) matrix, or several as (k, 4, 4)'
         ) from None
-    if motions.ndim not in (2, 3) or motions.shape[-2:] != (4, 4) or not motions.size:
-        raise ValueError(f"initial: got shape {motions.shape}, wanted (4, 4) or (k, 4, 4)")
-    if not np.isfinite(motions).all():
-        raise ValueError("initial: got numbers that are not finite, wanted a rigid motion")
-    motions = motions.reshape(-1, 4, 4)
-    rotations = motions[:, :3, :3]
-    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
-    last = np.abs(motions[:, 3] - [0, 0, 0, 1]).max()
-    if off > 1e-3 or (np.linalg.det(rotations) < 0).any() or last > 1e-6:
-        raise ValueError(
-            "initial: got a matrix that is no rigid motion, wanted a proper rotation "
-            "and a last row 0 0 0 1"
-        )
-    return motions
+    if given.ndim not in (2, 3) or given.shape[-2:] != (4, 4) or not given.size:
+        raise ValueError(f"initial: got shape {given.shape}, wanted (4, 4) or (k, 4, 4)")
+    return motions.check_rigid("initial", given, several=True).reshape(-1, 4, 4)

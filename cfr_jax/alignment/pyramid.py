@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from cfr_jax.alignment.planning import Plan
 from cfr_jax.alignment.solving import DISTANCE, Found
-from cfr_jax.geometry import rigid
+from cfr_jax.geometry import motions, rigid
 from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.geometry.units import bucket, subsample
@@ -116,8 +116,8 @@ def refine(
 
 
 def _unit(cloud, center, scale, motion):
-    points = (cloud.points @ motion[:3, :3].T + motion[:3, 3] - center) / scale
-    normals = None if cloud.normals is None else cloud.normals @ motion[:3, :3].T
+    points = (motions.apply(motion, cloud.points) - center) / scale
+    normals = None if cloud.normals is None else motions.rotate(motion, cloud.normals)
     return PointCloud(points, normals)
 
 
@@ -145,7 +145,7 @@ def _normals(points):
 
 def _pairs(level, transform, cut):
     """The closest target point of each source point, and its distance; infinite beyond the cut."""
-    moved = level.source @ transform[:3, :3].T + transform[:3, 3]
+    moved = motions.apply(transform, level.source)
     return level.tree.query(moved, distance_upper_bound=cut, workers=-1)
 
 

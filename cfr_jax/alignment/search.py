@@ -20,8 +20,7 @@ from jaxtyping import Array, Float
 
 from cfr_jax.alignment import planning, quality
 from cfr_jax.alignment.solving import on_device, surface, timed
-from cfr_jax.geometry import rigid, units
-from cfr_jax.geometry.rotations import cover
+from cfr_jax.geometry import motions, rigid, units
 from cfr_jax.networks.cfr.registration import encode, register
 from cfr_jax.networks.inputs import Settings, moved_by, prepare
 from cfr_jax.refine import generalized_icp
@@ -116,19 +115,16 @@ def polish(source: dict[str, Array], target: dict[str, Array], motions: Array) -
 
 def everywhere() -> Float[np.ndarray, "s 4 4"]:
     """Starts of unit clouds that cover all rotations, centroid on centroid."""
-    return _turned(cover(STARTS))
+    return motions.motion(motions.cover(STARTS))
 
 
 def around() -> Float[np.ndarray, "s 4 4"]:
     """Starts of unit clouds around the one where they lie, for a second look: that one, and turns
     about six axes by 40 and about the eight between them by 50 degrees."""
-    # imported here: half a second that most answers need not wait for
-    from scipy.spatial.transform import Rotation
-
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     between = np.array(list(itertools.product((1, -1), repeat=3))) / np.sqrt(3)
     turns = np.concatenate([np.zeros((1, 3)), 40 * axes, 50 * between])
-    return _turned(Rotation.from_rotvec(turns, degrees=True).as_matrix())
+    return motions.motion(motions.from_rotvec(np.radians(turns)))
 
 
 def given(frames: units.Frames, starts: Float[np.ndarray, "s 4 4"]) -> Float[np.ndarray, "s 4 4"]:
@@ -178,12 +174,6 @@ def search(
         frames=plan.frames,
         starts=len(starts),
     )
-
-
-def _turned(rotations):
-    starts = np.tile(np.eye(4), (len(rotations), 1, 1))
-    starts[:, :3, :3] = rotations
-    return starts
 
 
 def same(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Array:

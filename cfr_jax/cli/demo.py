@@ -76,11 +76,12 @@ def errors_in_words(estimate, truth, points) -> dict[str, str]:
     import numpy as np
 
     from cfr_jax.evaluation import metrics
+    from cfr_jax.geometry import motions
 
     rotation = metrics.err_r(estimate[None], truth[None])[0]
     translation = metrics.err_t(estimate[None], truth[None])[0]
     difference = estimate - truth
-    offsets = np.linalg.norm(points @ difference[:3, :3].T + difference[:3, 3], axis=1)
+    offsets = np.linalg.norm(motions.apply(difference, points), axis=1)
     return {
         "error": f"{rotation:.2f}° in rotation, {translation:.4f} m in translation",
         "points off": f"{offsets.mean():.4f} m on average",

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy.spatial.transform import Rotation
 
-from cfr_jax.data.protocol import NOISE_CLIP, NOISE_SCALE, random_motion, resample, way_back
+from cfr_jax.data.protocol import NOISE_CLIP, NOISE_SCALE, random_motion, resample
+from cfr_jax.geometry import motions
 from cfr_jax.geometry.neighbors import nearest_on_host
 
 _SHARES = (
@@ -169,7 +170,7 @@ def finish_pair(
         pair[f"{side}_neighbors"] = nearest_on_host(
             points, sampling.neighbors, radius=sampling.radius
         )
-    truth = moved["target"] @ turned @ way_back(motion) @ np.linalg.inv(moved["source"])
+    truth = moved["target"] @ turned @ motions.inverse(motion) @ np.linalg.inv(moved["source"])
     return pair | {"transform": truth.astype(np.float32)}
 
 

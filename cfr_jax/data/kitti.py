@@ -25,6 +25,7 @@ from jaxtyping import Float, Float32, Int
 from cfr_jax.data.pairs import Pair
 from cfr_jax.data.protocol import random_motion, resample
 from cfr_jax.data.scans import estimate_normals, refine_point_to_plane, voxel_mean
+from cfr_jax.geometry import motions
 from cfr_jax.runtime.atomic import unfinished
 from cfr_jax.runtime.progress import Progress
 
@@ -80,9 +81,9 @@ def scan_pair(
     source_frame, target_frame = scans.frames[index]
     return Pair(
         name=f"{scans.sequence}/{source_frame:06d}-{target_frame:06d}",
-        source=(source @ motion[:3, :3].T + motion[:3, 3]).astype(np.float32),
+        source=motions.apply(motion, source).astype(np.float32),
         target=target,
-        source_normals=(source_normals @ motion[:3, :3].T).astype(np.float32),
+        source_normals=motions.rotate(motion, source_normals).astype(np.float32),
         target_normals=target_normals,
         transform=scans.transforms[index] @ np.linalg.inv(motion),
         overlap=float(scans.fitness[index]),

@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
-RIGID_TOLERANCE = 1e-3  # of a written rotation, whose numbers may have three digits
+from cfr_jax.geometry.motions import check_rigid
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,30 +153,16 @@ class Hdf5Pairs(PairFile):
                 held[key] = _checked_rows(
                     held[key], like=held[key.split("_")[0]], where=where, key=key
                 )
+        truth = held.get("transform")
         return Pair(
             name=name,
             source=held["source"],
             target=held["target"],
             source_normals=held.get("source_normals"),
             target_normals=held.get("target_normals"),
-            transform=checked_motion(held["transform"], where) if "transform" in held else None,
+            transform=None if truth is None else check_rigid(f"{where}: transform", truth),
             overlap=float(held["overlap"]) if "overlap" in held else None,
         )
-
-
-def checked_motion(values: np.ndarray, where: str) -> Float[np.ndarray, "4 4"]:
-    """A (4, 4) rigid motion in float64, or a ValueError that says `where` it is not one."""
-    motion = np.asarray(values, np.float64)
-    if motion.shape != (4, 4) or not np.isfinite(motion).all():
-        raise ValueError(f"{where}: transform is {motion.shape}, wanted (4, 4) finite numbers")
-    rotation = motion[:3, :3]
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or (motion[3] != [0, 0, 0, 1]).any():
-        raise ValueError(
-            f"{where}: transform is not rigid (R Rᵀ is {off:.2g} off the identity, "
-            f"det R = {np.linalg.det(rotation):.3g}, last row {motion[3].tolist()})"
-        )
-    return motion
 
 
 def _parse_row(
@@ -198,7 +184,7 @@ def _parse_row(
         raise ValueError(f"{where}: {error}; wanted 16 numbers after the two files") from error
     if len(values) != 16:
         raise ValueError(f"{where}: {len(values)} numbers after the two files, wanted 16 or none")
-    return source, target, checked_motion(values.reshape(4, 4), where)
+    return source, target, check_rigid(f"{where}: transform", values.reshape(4, 4))
 
 
 def _checked_rows(

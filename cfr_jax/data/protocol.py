@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
-from scipy.spatial.transform import Rotation
 
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.pairs import Pair
+from cfr_jax.geometry import motions
 
 Rng = np.random.RandomState | np.random.Generator
 
@@ -124,7 +124,7 @@ def random_motion(
     """
     motion = np.eye(4)
     if angle is None:
-        motion[:3, :3] = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+        motion[:3, :3] = motions.from_quaternion(rng.normal(size=4))
     else:
         x, y, z = (rng.uniform() * np.pi * angle / 180.0 for _ in range(3))
         if both_ways:
@@ -135,14 +135,6 @@ def random_motion(
         motion[:3, :3] = about_x @ about_y @ about_z
     motion[:3, 3] = rng.uniform(-translation, translation, 3)
     return motion.astype(np.float32)
-
-
-def way_back(motion: Float32[np.ndarray, "4 4"]) -> Float32[np.ndarray, "4 4"]:
-    """The inverse of a rigid motion, in its own float32: the truth that a pair is told."""
-    back = np.eye(4, dtype=np.float32)
-    back[:3, :3] = motion[:3, :3].T
-    back[:3, 3] = -motion[:3, :3].T @ motion[:3, 3]
-    return back
 
 
 def resample(size: int, count: int, rng: Rng) -> Int[np.ndarray, " count"]:
@@ -184,10 +176,9 @@ def _make_pair(
 
     rng = reseed()
     motion = random_motion(protocol.angle, protocol.translation, rng, both_ways=protocol.both_ways)
-    rotation = motion[:3, :3]
     # the cropped rows are moved, as published: a product of all rows may round its last bit apart
-    source = points[source_rows] @ rotation.T + motion[:3, 3]
-    source_normals = normals[source_rows] @ rotation.T
+    source = motions.apply(motion, points[source_rows])
+    source_normals = motions.rotate(motion, normals[source_rows])
     target, target_normals = points[target_rows], normals[target_rows]
 
     if protocol.keep is not None or protocol.noise:
@@ -207,8 +198,8 @@ def _make_pair(
         target=target[target_order],
         source_normals=source_normals[source_order],
         target_normals=target_normals[target_order],
-        transform=way_back(motion),
+        transform=motions.inverse(motion),
         overlap=overlap,
-        clean_source=points @ rotation.T + motion[:3, 3],
+        clean_source=motions.apply(motion, points),
         clean_target=points,
     )

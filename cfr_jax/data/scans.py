@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
+
+from cfr_jax.geometry import motions
 
 # Open3D's stopping rule, whose truths the published KITTI pairs use.
 SETTLED = 1e-6
@@ -76,7 +77,7 @@ def refine_point_to_plane(
     transform = np.array(initial, np.float64)
     before = (np.inf, np.inf)
     for _ in range(MAX_ITERATIONS):
-        moved = source @ transform[:3, :3].T + transform[:3, 3]
+        moved = motions.apply(transform, source)
         distances, rows = tree.query(moved, distance_upper_bound=threshold)
         near = np.isfinite(distances)
         fitness = float(near.mean())
@@ -102,7 +103,5 @@ def _plane_step(
     rows = np.concatenate([np.cross(points - center, normals), normals], axis=1)
     heights = np.einsum("ni,ni->n", targets - points, normals)
     twist, *_ = np.linalg.lstsq(rows.T @ rows, rows.T @ heights, rcond=1e-9)
-    step = np.eye(4)
-    step[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
-    step[:3, 3] = center - step[:3, :3] @ center + twist[3:]
-    return step
+    turn = motions.from_rotvec(twist[:3])
+    return motions.motion(turn, center - turn @ center + twist[3:])

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from cfr_jax.data import kitti, protocol
@@ -15,6 +14,7 @@ from cfr_jax.data.corpus import Corpus, read_corpus
 from cfr_jax.data.layout import recognize
 from cfr_jax.data.modelnet import read_modelnet40
 from cfr_jax.data.pairs import Hdf5Pairs, Pair, among, open_pairs
+from cfr_jax.geometry.motions import nearest_motion
 
 _PROTOCOLS = {
     made.name: made
@@ -140,12 +140,3 @@ def _checked(pair: Pair) -> Pair:
         raise ValueError(f"pair {pair.name} has no true transform to measure against")
     # Rigid in float64: the angle between rotations rounded to float32 reads up to 0.03 degrees.
     return dataclasses.replace(pair, transform=nearest_motion(pair.transform))
-
-
-def nearest_motion(transform: np.ndarray) -> np.ndarray:
-    """The (4, 4) motions whose rotations are the closest proper ones; float64, any leading axes."""
-    motion = np.array(transform, np.float64)
-    u, _, vt = np.linalg.svd(motion[..., :3, :3])
-    u[..., :, 2] *= np.linalg.det(u @ vt)[..., None]
-    motion[..., :3, :3] = u @ vt
-    return motion

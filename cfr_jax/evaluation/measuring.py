@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation import metrics
-from cfr_jax.evaluation.datasets import nearest_motion
 from cfr_jax.evaluation.metrics import Statistic
 from cfr_jax.evaluation.store import Records
+from cfr_jax.geometry.motions import nearest_motion
 
 # Root mean square and mean absolute differences of Euler angles and of coordinates.
 _BY_AXIS = ("r_mae", "r_rmse", "t_mae", "t_rmse")

@@ -17,6 +17,8 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from cfr_jax.geometry import motions
+
 Motions = Float[np.ndarray, "_pairs 4 4"]
 Errors = Float[np.ndarray, " _pairs"]
 
@@ -88,9 +90,9 @@ def chamfer(
         _finite("clean_target", clean_target),
     ]
     source, target, clean_source, clean_target = clouds
-    rotation, translation = (_finite("estimate", estimate)[:3, part] for part in (slice(3), 3))
-    forward, _ = cKDTree(clean_target).query(source @ rotation.T + translation)
-    backward, _ = cKDTree(clean_source @ rotation.T + translation).query(target)
+    estimate = _finite("estimate", estimate)
+    forward, _ = cKDTree(clean_target).query(motions.apply(estimate, source))
+    backward, _ = cKDTree(motions.apply(estimate, clean_source)).query(target)
     return float(np.square(forward).mean() + np.square(backward).mean())
 
 

@@ -16,10 +16,10 @@ from cfr_jax.evaluation import machine, store
 from cfr_jax.evaluation.methods import Answer, Method
 from cfr_jax.evaluation.store import Record, Records
 from cfr_jax.evaluation.worker import Failed, Missing, Worker
+from cfr_jax.geometry.motions import are_rigid
 
 _SAVE_EVERY = 5.0  # seconds
 _MODULE_PAIRS = 9
-_RIGID = 1e-3  # how far from orthonormal a rotation in float32 may be, generously
 
 
 def run_method(method: Method, pairs: Sequence[Pair], path: Path, timeout: float) -> Records:
@@ -103,13 +103,6 @@ def _record(pair: str, answer: Answer) -> Record:
     transforms = np.asarray(answer.transforms, np.float64)
     if transforms.ndim != 3 or transforms.shape[1:] != (4, 4) or not len(transforms):
         return Record(pair, failure=f"answered an array {transforms.shape}, wanted (i, 4, 4)")
-    rotations = transforms[:, :3, :3]
-    rigid = (
-        np.isfinite(transforms).all()
-        and np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max() < _RIGID
-        and (np.linalg.det(rotations) > 0).all()
-        and np.abs(transforms[:, 3] - [0, 0, 0, 1]).max() < _RIGID
-    )
-    if not rigid:
+    if not are_rigid(transforms).all():
         return Record(pair, failure="answered no rigid motion")
     return Record(pair, transforms.tolist(), float(answer.seconds))

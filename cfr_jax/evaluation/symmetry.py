@@ -27,6 +27,7 @@ from tqdm import tqdm
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.store import code_digest
+from cfr_jax.geometry import motions
 from cfr_jax.runtime.atomic import write_atomically
 
 LIMIT = 2.0
@@ -75,14 +76,14 @@ def asymmetry(points: Float[np.ndarray, "n 3"]) -> float:
     _, principal = np.linalg.eigh(points.T @ points)
     axes = np.concatenate([principal.T, np.eye(3)])
     turns = [
-        Rotation.from_rotvec(np.radians(angle) * axis).as_matrix()
+        motions.from_rotvec(np.radians(angle) * axis)
         for axis, angle in itertools.product(axes, _TURNS)
     ]
     turns.sort(key=lambda turn: float(np.square(tree.query(some @ turn.T)[0]).mean()))
     best = np.inf
     for turn in turns[:_TRIED]:
         rotation, moved = _closer(points, tree, turn)
-        if Rotation.from_matrix(rotation).magnitude() < np.radians(_LEAST):
+        if motions.angle_between(motions.motion(rotation), np.eye(4)) < _LEAST:
             continue
         there, back = tree.query(moved)[0], cKDTree(moved).query(points)[0]
         best = min(best, np.square(there).mean() + np.square(back).mean())

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from cfr_jax.geometry import motions
 from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.io import PointCloud
 
@@ -41,23 +42,21 @@ class Frames:
     def to_caller(self, transforms: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
         """Motions between the unit clouds as motions of the caller's source onto the target."""
         transforms = np.asarray(transforms, np.float64)
-        rotation = _orthonormal(transforms[..., :3, :3])
-        moved = np.broadcast_to(np.eye(4), transforms.shape).copy()
-        moved[..., :3, :3] = rotation
+        # float32's 1e-7 would show at a million meters
+        rotation = motions.nearest_rotation(transforms[..., :3, :3])
         # rotate about the source's center, so that large coordinates never multiply float32's error
-        moved[..., :3, 3] = (
+        shift = (
             self.target_center + self.scale * transforms[..., :3, 3] - rotation @ self.source_center
         )
-        return moved @ self.initial
+        return motions.motion(rotation, shift) @ self.initial
 
-    def to_unit(self, motions: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
+    def to_unit(self, transforms: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
         """The other way: motions of the caller's source as motions between the unit clouds."""
-        motions = np.asarray(motions, np.float64) @ np.linalg.inv(self.initial)
-        unit = motions.copy()
-        unit[..., :3, :3] = _orthonormal(motions[..., :3, :3])
-        place = motions[..., :3, :3] @ self.source_center + motions[..., :3, 3]
-        unit[..., :3, 3] = (place - self.target_center) / self.scale
-        return unit
+        transforms = np.asarray(transforms, np.float64) @ np.linalg.inv(self.initial)
+        turns = transforms[..., :3, :3]
+        place = turns @ self.source_center + transforms[..., :3, 3]
+        shift = (place - self.target_center) / self.scale
+        return motions.motion(motions.nearest_rotation(turns), shift)
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def unit_frames(
     scale, ratio = max(source_radius, target_radius), source_radius / target_radius
     if initial is None:
         return Frames(source_center, target_center, scale, np.eye(4), ratio)
-    place = initial[:3, :3] @ source_center + initial[:3, 3]
+    place = motions.apply(initial, source_center)
     away = float(np.abs(place - target_center).max())
     if not away <= FARTHEST * scale:
         raise ValueError(
@@ -96,9 +95,8 @@ def unit_frames(
         )
     # What is off by rounding is made a rotation, about the source's center: far from the origin
     # the slightest turn about that would move the cloud.
-    exact = np.eye(4)
-    exact[:3, :3] = _orthonormal(initial[:3, :3])
-    exact[:3, 3] = place - exact[:3, :3] @ source_center
+    turn = motions.nearest_rotation(initial[:3, :3])
+    exact = motions.motion(turn, place - turn @ source_center)
     return Frames(target_center, target_center, scale, exact, ratio)
 
 
@@ -117,7 +115,7 @@ def to_unit(
 
     Stray points, more than four radii out, are left out.
     """
-    points = (cloud.points @ motion[:3, :3].T + motion[:3, 3] - center) / scale
+    points = (motions.apply(motion, cloud.points) - center) / scale
     near = np.linalg.norm(points - np.median(points, axis=0), axis=1) <= _STRAY
     rows = np.flatnonzero(near)
     rows = rows[subsample(points[rows], budget, seed)]
@@ -128,7 +126,7 @@ def to_unit(
     pad = ((0, size - count), (0, 0))
     normals = None
     if cloud.normals is not None:
-        normals = (cloud.normals[rows] @ motion[:3, :3].T).astype(np.float32)
+        normals = motions.rotate(motion, cloud.normals[rows]).astype(np.float32)
         normals = np.pad(normals, pad)
     return UnitCloud(np.pad(used, pad), normals, np.pad(found, pad), np.arange(size) < count, rows)
 
@@ -197,11 +195,3 @@ def _first_of_each_voxel(points, voxel):
     extent = cells.max(axis=0) + 1
     keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
     return np.unique(keys, return_index=True)[1]
-
-
-def _orthonormal(rotations):
-    """The closest proper rotations: float32's 1e-7 would show at a million meters."""
-    u, _, vt = np.linalg.svd(rotations)
-    sign = np.linalg.det(u @ vt)
-    u[..., :, 2] *= sign[..., None]
-    return u @ vt

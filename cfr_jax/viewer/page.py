@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int, UInt8
 
+from cfr_jax.geometry import motions
 from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.viewer.camera import Camera, best_view
 from cfr_jax.viewer.scene import Scene
@@ -100,11 +101,11 @@ def _payload(scene: Scene, camera: Camera, max_points: int) -> dict[str, Any]:
             {
                 "label": label,
                 "matrix": transform.tolist(),
-                "rotation": _quaternion(transform[:3, :3]).tolist(),
+                "rotation": motions.to_quaternion(transform[:3, :3]).tolist(),
                 # Where the middle of the source lies: what moves evenly between two stations,
                 # whatever the distance of the cloud from its origin.
                 "position": (
-                    (transform[:3, :3] @ source_center + transform[:3, 3] - camera.center) / scale
+                    (motions.apply(transform, source_center) - camera.center) / scale
                 ).tolist(),
                 "radius": float(radius) / scale,
             }
@@ -112,7 +113,7 @@ def _payload(scene: Scene, camera: Camera, max_points: int) -> dict[str, Any]:
                 scene.labels, scene.transforms, camera.radii, strict=True
             )
         ],
-        "view": _quaternion(camera.rotation).tolist(),
+        "view": motions.to_quaternion(camera.rotation).tolist(),
         "facts": list(scene.facts.items()),
         "warnings": list(scene.warnings),
     }
@@ -152,22 +153,3 @@ def _weights(weights: Float64[np.ndarray, " n"]) -> str:
 
 def _base64(array: Int[np.ndarray, "..."] | UInt8[np.ndarray, "..."]) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
-
-
-def _quaternion(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 4"]:
-    """Unit quaternion x, y, z, w of a rotation, also of one that is orthonormal only roughly.
-
-    The eigenvector of the largest eigenvalue of Bar-Itzhack's symmetric matrix; the sign is the
-    one with w >= 0.
-    """
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    symmetric = np.array(
-        [
-            [a - e - i, b + d, c + g, h - f],
-            [b + d, e - a - i, f + h, c - g],
-            [c + g, f + h, i - a - e, d - b],
-            [h - f, c - g, d - b, a + e + i],
-        ]
-    )
-    quaternion = np.linalg.eigh(symmetric)[1][:, -1]
-    return quaternion if quaternion[3] >= 0 else -quaternion

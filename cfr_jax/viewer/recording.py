@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 
+from cfr_jax.geometry import motions
 from cfr_jax.runtime.atomic import unfinished
 from cfr_jax.viewer.camera import best_view
 from cfr_jax.viewer.picture import SOURCE, TARGET
@@ -45,7 +46,7 @@ def write_recording(path: str | os.PathLike[str], scene: Scene) -> None:
         stream.log("source/points", points(scene.source - middle, SOURCE), static=True)
         for k, (label, transform) in enumerate(zip(scene.labels, scene.transforms, strict=True)):
             # of the source's middle, and without the offset: a difference taken in float64
-            position = transform[:3, :3] @ middle + transform[:3, 3] - center
+            position = motions.apply(transform, middle) - center
             stream.set_time("station", sequence=k)
             stream.log("station", rr.TextDocument(label))
             stream.log("source", rr.Transform3D(mat3x3=transform[:3, :3], translation=position))

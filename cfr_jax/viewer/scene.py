@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
-# Interpolating between stations needs rotations; float32 results are orthonormal to about 1e-6.
-RIGID_TOLERANCE = 1e-3
+from cfr_jax.geometry import motions
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +64,7 @@ class Scene:
     def moved(self, station: int) -> Float64[np.ndarray, "n 3"]:
         """Source points at one station, in the target's frame."""
         transform = self.transforms[station]
-        return self.source @ transform[:3, :3].T + transform[:3, 3]
+        return motions.apply(transform, self.source)
 
 
 def _array(name: str, value: ArrayLike) -> Float64[np.ndarray, "..."]:
@@ -91,21 +90,8 @@ def _stations(value: ArrayLike) -> Float64[np.ndarray, "s 4 4"]:
     transforms = _array("transforms", value)
     if transforms.ndim != 3 or transforms.shape[1:] != (4, 4) or len(transforms) < 2:
         raise ValueError(f"transforms: got shape {transforms.shape}, wanted (S, 4, 4) with S >= 2")
-    for index, transform in enumerate(transforms):
-        rotation = transform[:3, :3]
-        # Written so that NaN fails too: a comparison with NaN is false.
-        rigid = (
-            np.isfinite(transform).all()
-            and np.abs(rotation @ rotation.T - np.eye(3)).max() < RIGID_TOLERANCE
-            and np.linalg.det(rotation) > 0
-            and np.abs(transform[3] - (0, 0, 0, 1)).max() < RIGID_TOLERANCE
-        )
-        if not rigid:
-            raise ValueError(
-                f"transforms[{index}]: wanted a rigid motion (a proper rotation, a translation, "
-                f"last row 0 0 0 1), got {transform.tolist()}"
-            )
-    return transforms
+    # interpolating between stations needs rotations
+    return motions.check_rigid("transforms", transforms, several=True)
 
 
 def _weights(value: ArrayLike, count: int) -> Float64[np.ndarray, " n"]:

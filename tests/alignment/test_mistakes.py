@@ -65,7 +65,7 @@ MISTAKES = {
     "a list of nothing": ("batch empty.csv --out r.csv", "wanted lines of `source,target`"),
     "semicolons": ("batch semicolons.csv --out r.csv", "line 1: wanted `source,target`"),
     "three numbers": ("batch three.csv --out r.csv", "3 numbers after the two files, wanted 16"),
-    "a truth that scales": ("batch scaled.csv --out r.csv", "transform is not rigid"),
+    "a truth that scales": ("batch scaled.csv --out r.csv", "got a matrix that is not rigid"),
     "other columns": ("batch columns.csv --out r.csv", "wanted 16 numbers after the two files"),
     "a binary list": ("batch binary.csv --out r.csv", "wanted a CSV list"),
     "a cloud for a list": ("batch a.ply --out r.csv", "wanted a CSV list or an HDF5 file of pairs"),

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation import store
-from cfr_jax.evaluation.datasets import nearest_motion, read_pairs
+from cfr_jax.evaluation.datasets import read_pairs
 from cfr_jax.evaluation.drawing.tables import write_table
 from cfr_jax.evaluation.measuring import measure, only, summarize
 from cfr_jax.evaluation.methods import Answer, Method, clouds_of, make_baseline, methods_of
@@ -310,15 +310,6 @@ def test_a_pair_without_truth_cannot_be_measured(tmp_path):
     data = ConfigDict({"kind": "pairs", "path": str(tmp_path / "pairs.h5")})
     with pytest.raises(ValueError, match="pair a has no true transform"):
         read_pairs(data, 0, tmp_path)
-
-
-def test_the_nearest_motion_is_rigid_and_leaves_rigid_motions_alone():
-    pair = a_pair()
-    bent = pair.transform + np.pad(np.full((3, 3), 1e-4), ((0, 1), (0, 1)))
-    rotation = nearest_motion(np.stack([bent, bent]))[1, :3, :3]
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
-    assert np.linalg.det(rotation) > 0
-    np.testing.assert_allclose(nearest_motion(pair.transform), pair.transform, atol=1e-15)
 
 
 def test_normals_are_withheld_where_they_are_unusable_or_not_wanted():

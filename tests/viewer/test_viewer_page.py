@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from cfr_jax.viewer import Scene, write_page
 from cfr_jax.viewer.camera import best_view
-from cfr_jax.viewer.page import _quaternion
 
 HOSTILE = [
     "</script><img src=x onerror=alert(1)>",
@@ -93,14 +92,6 @@ def test_the_page_shows_every_station_where_the_transform_puts_the_source(tmp_pa
         np.testing.assert_allclose(
             in_units(turned + station["position"]), scene.moved(k), rtol=0, atol=2e-4
         )
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 2.0, np.pi - 1e-9, np.pi])
-@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 3)])
-def test_quaternions_agree_with_scipy_up_to_half_a_turn(axis, angle):
-    rotation = Rotation.from_rotvec(np.array(axis) / np.linalg.norm(axis) * angle)
-    found = Rotation.from_quat(_quaternion(rotation.as_matrix()))
-    assert (found * rotation.inv()).magnitude() < 1e-7
 
 
 def test_weights_are_carried_with_unused_points_marked(tmp_path):

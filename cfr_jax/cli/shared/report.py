@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from cfr_jax import __version__
 from cfr_jax.alignment.align import Initial, align
 from cfr_jax.alignment.answers import Alignment
+from cfr_jax.geometry import motions
 from cfr_jax.io import PointCloud
 from cfr_jax.viewer import Scene
 from cfr_jax.weights.files import DEFAULT, Weights, read_weights
@@ -33,9 +34,9 @@ class Result:
 
     def moved_source(self) -> PointCloud:
         """The whole source, laid on the target."""
-        rotation, translation = self.alignment.transform[:3, :3], self.alignment.transform[:3, 3]
-        normals = None if self.source.normals is None else self.source.normals @ rotation.T
-        return PointCloud(self.source.points @ rotation.T + translation, normals, self.source.name)
+        transform, normals = self.alignment.transform, self.source.normals
+        normals = None if normals is None else motions.rotate(transform, normals)
+        return PointCloud(motions.apply(transform, self.source.points), normals, self.source.name)
 
 
 def register(
@@ -101,10 +102,8 @@ def as_document(result: Result, source_path: str, target_path: str) -> dict[str,
 def as_text(result: Result) -> str:
     """The transform and its quality, for people."""
     found = result.alignment
-    rotation, translation = found.transform[:3, :3], found.transform[:3, 3]
-    # by the chord |R - 1|: scipy's rotations take a twelfth of the command's time to import
-    chord = float(np.linalg.norm(rotation - np.eye(3)))
-    angle = np.degrees(2 * np.arcsin(min(chord / 8**0.5, 1.0)))
+    angle = motions.angle_between(found.transform, np.eye(4))
+    translation = found.transform[:3, 3]
     verdict = "trusted" if found.trusted else "not trusted"
     if not found.determined:
         verdict += ", not determined"

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from cfr_jax import io
 from cfr_jax.cli.shared import report
+from cfr_jax.geometry import motions
 from cfr_jax.io import PointCloud
 from cfr_jax.viewer import Scene
 
@@ -121,7 +122,7 @@ def _doubts(document, source, target):
     transform = np.asarray(document["transform"], np.float64)
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
         return  # the scene says so
-    moved = source.points[rows] @ transform[:3, :3].T + transform[:3, 3]
+    moved = motions.apply(transform, source.points[rows])
     away = cKDTree(target.points).query(moved)[0]
     fitness = float((away <= document["inlier_distance"]).mean())
     if fitness < document["fitness"] - _WORSE:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from cfr_jax.geometry import motions
 from cfr_jax.io.formats import gltf, ply, surfaces
 from cfr_jax.io.mesh import Mesh, fan_triangles
 
@@ -118,7 +119,7 @@ class _Ac3d:
                     pass
 
     def _place(self, points: np.ndarray, motion: Float64[np.ndarray, "4 4"]) -> None:
-        self.vertices.append(points @ motion[:3, :3].T + motion[:3, 3])
+        self.vertices.append(motions.apply(motion, points))
         self._seen += len(points)
 
     def _read_surface(self, first: int, count: int) -> None:

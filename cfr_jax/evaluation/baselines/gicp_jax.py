@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from cfr_jax.data.scans import estimate_normals
 from cfr_jax.evaluation.baselines.start import Start, initial
+from cfr_jax.geometry import motions
 from cfr_jax.io import PointCloud
 from cfr_jax.refine import generalized_icp
 
@@ -28,16 +29,15 @@ def register(
     """
     motion = initial(source, target, start)
     center, scale = target.points.mean(axis=0), cut / generalized_icp.CUT
-    moved = source.points @ motion[:3, :3].T + motion[:3, 3]
+    moved = motions.apply(motion, source.points)
     found = _refine(
         *(jnp.asarray((points - center) / scale, jnp.float32) for points in (moved, target.points)),
         *(jnp.asarray(_normals(cloud, normal_radius), jnp.float32) for cloud in (source, target)),
     )
     unit = np.asarray(found, np.float64)
     # x = center + scale * u on both sides
-    answer = unit.copy()
-    answer[:3, 3] = center + scale * unit[:3, 3] - unit[:3, :3] @ center
-    return answer @ motion
+    shift = center + scale * unit[:3, 3] - unit[:3, :3] @ center
+    return motions.motion(unit[:3, :3], shift) @ motion
 
 
 @jax.jit

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cfr_jax.geometry.rotations import cover
+from cfr_jax.geometry.motions import cover
 
 
 def farthest(rotations, probes):
