@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import os
 import tempfile
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from cfr_jax.data.making.furniture import FurnitureLibrary
 from cfr_jax.data.making.open_cad import UNSEEN, category_of
 from cfr_jax.data.making.packages import extract
 from cfr_jax.data.making.shapes import make_shape
+from cfr_jax.runtime.atomic import write_atomically
 
 LIBRARY = "usr/share/sweethome3d/furniture/BlendSwap-CC-0.sh3f"
 STEM = "BlendSwap-CC-0"
@@ -88,9 +88,7 @@ def main() -> None:
         (args.out / "held_out.npz", stream.getvalue()),
         (args.out / "held_out.md", credits.encode()),
     ):
-        beside = path.with_name(f".{path.name}.part")
-        beside.write_bytes(content)
-        os.replace(beside, path)
+        write_atomically(path, content)
         print(f"wrote {path} ({len(content) / 1e3:.0f} kB)")
 
 

@@ -31,7 +31,7 @@ class PointCloud:
         points: (n, 3) float64, n >= 1, in the unit and the frame they came in.
         normals: (n, 3) float64 of length one, or None.
         name: what to call the cloud in messages and pictures: for a file, its name.
-        dropped: rows left out on reading because they carry no point, which organized PCD
+        left_out: rows left out on reading because they carry no point, which organized PCD
             clouds mark by NaN.
     """
 
@@ -39,7 +39,7 @@ class PointCloud:
     points: np.ndarray
     normals: np.ndarray | None = None
     name: str = "cloud"
-    dropped: int = 0
+    left_out: int = 0
 
     def __post_init__(self) -> None:
         points = checked_points(self.points)
@@ -101,6 +101,22 @@ def usable_normals(normals: Real[np.ndarray, "n 3"]) -> Real[np.ndarray, "n 3"] 
     low, high = normals.min(axis=1), normals.max(axis=1)
     whole = np.isfinite(low) & np.isfinite(high) & ((low < 0) | (high > 0))
     return normals if whole.all() else None
+
+
+def cloud_of_filled(points: np.ndarray, normals: np.ndarray | None, name: str) -> PointCloud:
+    """The rows of an organized cloud that hold a point, with their normals if all are usable.
+
+    Rows with a NaN in x, y or z are cells without a point: left out, and counted in `left_out`.
+    Raises ValueError where no row is left.
+    """
+    filled = ~np.isnan(points).any(axis=1)
+    left_out = len(points) - int(np.count_nonzero(filled))
+    if left_out and left_out == len(points):
+        raise ValueError(f"all {left_out} points are NaN, wanted at least one that is not")
+    if left_out:
+        points, normals = points[filled], None if normals is None else normals[filled]
+    usable = None if normals is None or not len(points) else usable_normals(normals)
+    return PointCloud(points, usable, name, left_out)
 
 
 # More numbers than this to a point are not seen; three long rows are a cloud on its side.

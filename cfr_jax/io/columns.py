@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cfr_jax.io.cloud import PointCloud, usable_normals
+from cfr_jax.io.cloud import PointCloud, cloud_of_filled, usable_normals
 
 # sensor_msgs/PointField: the numbers of the types.
 _ROS_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -24,7 +24,7 @@ def is_point_cloud2(obj: Any) -> bool:
 def from_point_cloud2(message: Any, name: str) -> PointCloud:
     """The points of a message, with normal_x, normal_y, normal_z if it has them.
 
-    Cells without a point, which drivers mark by NaN, are left out and counted in `dropped`. Raises
+    Cells without a point, which drivers mark by NaN, are left out and counted in `left_out`. Raises
     ValueError for fields or sizes that do not fit the data.
     """
     order = ">" if message.is_bigendian else "<"
@@ -63,19 +63,10 @@ def from_structured(array: np.ndarray, name: str) -> PointCloud:
     """Fields x, y, z of a structured array of any shape, and normals if they are there.
 
     Rows with a NaN in x, y or z carry no point, as ROS marks them: they are left out and counted
-    in `dropped`.
+    in `left_out`.
     """
     flat = array.reshape(-1)
-    points, normals = _columns(array.dtype.names, lambda column: flat[column])
-    filled = ~np.isnan(points).any(axis=1)
-    dropped = len(points) - int(np.count_nonzero(filled))
-    if dropped and dropped == len(points):
-        raise ValueError(f"all {dropped} points are NaN, wanted at least one that is not")
-    if dropped:
-        points, normals = points[filled], None if normals is None else normals[filled]
-    return PointCloud(
-        points, None if normals is None else usable_normals(normals), name, dropped=dropped
-    )
+    return cloud_of_filled(*_columns(array.dtype.names, lambda column: flat[column]), name)
 
 
 def from_data_frame(frame: Any, name: str) -> PointCloud | None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import stat
-import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
@@ -13,6 +11,7 @@ from typing import BinaryIO
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.formats import arrays, gltf, las, pcd, ply, surfaces, text
 from cfr_jax.io.mesh import Mesh
+from cfr_jax.runtime.atomic import unfinished
 
 _READERS: dict[str, Callable[..., PointCloud | Mesh]] = {
     ".ply": ply.parse,
@@ -90,19 +89,14 @@ def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
             cloud lies so far from its origin that PCD's float32 would deform it.
     """
     path = Path(path)
-    beside = path.parent / f".{uuid.uuid4().hex}{path.suffix}"
     try:
         save = _chosen(_WRITERS, path.suffix.lower())
-        with open(beside, "xb") as stream:
+        with unfinished(path) as beside, open(beside, "xb") as stream:
             save(stream, cloud)
-        os.replace(beside, path)
     except OSError as error:
         raise CloudFileError(f"{path}: cannot be written: {error.strerror}") from None
     except CloudFileError as error:
         raise CloudFileError(f"{path}: {error}") from None
-    finally:
-        with contextlib.suppress(OSError):  # it is there only if something went wrong
-            beside.unlink()
 
 
 def _chosen(formats: dict[str, Callable], suffix: str) -> Callable:

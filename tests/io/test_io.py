@@ -193,7 +193,7 @@ def test_empty_cells_of_an_organized_pcd_are_left_out_and_counted(tmp_path):
     cloud = read(tmp_path / "cloud.pcd")
 
     # then
-    assert cloud.dropped == 2
+    assert cloud.left_out == 2
     np.testing.assert_array_equal(cloud.points, np.delete(points(), [3, 4], axis=0))
     np.testing.assert_allclose(cloud.normals, np.delete(normals(), [3, 4], axis=0), atol=1e-6)
 

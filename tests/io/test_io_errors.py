@@ -157,7 +157,7 @@ def test_values_that_are_no_coordinates_are_refused_in_binary_files_too(name, va
 
     # then
     if name == "binary.pcd" and np.isnan(value):
-        assert read(path).dropped == 1  # how PCD marks a cell without a point
+        assert read(path).left_out == 1  # how PCD marks a cell without a point
     else:
         assert re.search("point 0 is|the offset is", refusal(path))
 

@@ -74,7 +74,7 @@ def test_a_ros_message_is_read_as_its_fields_say(kind, bigendian):
     )
     cloud = as_point_cloud(given, name="scan")
     np.testing.assert_array_equal(cloud.points, points().astype("f4"))
-    assert cloud.normals is None and cloud.name == "scan" and cloud.dropped == 0
+    assert cloud.normals is None and cloud.name == "scan" and cloud.left_out == 0
 
 
 def test_the_normals_of_a_ros_message_are_kept():
@@ -89,7 +89,7 @@ def test_cells_of_a_ros_message_without_a_point_are_left_out_and_counted():
     holes[[0, 7, 59]] = np.nan
     cloud = as_point_cloud(message(xyz(holes), height=6), name="scan")
     np.testing.assert_array_equal(cloud.points, np.delete(points(), [0, 7, 59], 0).astype("f4"))
-    assert cloud.dropped == 3
+    assert cloud.left_out == 3
 
 
 def broken(**changes):
@@ -135,7 +135,7 @@ def test_structured_arrays_are_taken_in_any_shape():
     cells["x"][0, 0] = np.nan
     cloud = as_point_cloud(cells, name="source")
     np.testing.assert_allclose(cloud.points, points()[1:], rtol=1e-6)
-    assert cloud.dropped == 1
+    assert cloud.left_out == 1
     with pytest.raises(ValueError, match=r"^source: has no y and no z among a, x"):
         as_point_cloud(np.zeros(4, [("a", "f4"), ("x", "f4")]), name="source")
 

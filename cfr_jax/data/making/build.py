@@ -129,12 +129,12 @@ def build(
     def bar(pairs):
         return Progress(pairs, desc="comparing", unit=" pairs", disable=quiet)
 
-    dropped = drop_duplicates(shapes, [item.category not in held_back for item in kept], bar)
-    for row, other in dropped.items():
+    repeats = drop_duplicates(shapes, [item.category not in held_back for item in kept], bar)
+    for row, other in repeats.items():
         report.left_out[kept[row].name] = f"repeats {kept[other].name}"
     # An order by hash, so that the first rows are a fair sample of the whole.
     rows = sorted(
-        (row for row in range(len(kept)) if row not in dropped),
+        (row for row in range(len(kept)) if row not in repeats),
         key=lambda row: name_share(kept[row].name, "order"),
     )
     if not rows:

@@ -47,16 +47,16 @@ def drop_duplicates(
     """
     order = sorted(range(len(shapes)), key=lambda row: (not seen[row], row))
     rank = {row: place for place, row in enumerate(order)}
-    dropped: dict[int, int] = {}
+    repeats: dict[int, int] = {}
     first_with: dict[str, int] = {}
     for row in order:
         if (first := first_with.setdefault(shapes[row].fingerprint, row)) != row:
-            dropped[row] = first
+            repeats[row] = first
 
     axes = [_principal_axes(shape.points) for shape in shapes]
     tree = lru_cache(maxsize=512)(lambda row: cKDTree(shapes[row].points))
     for later, earlier in progress(_candidates(shapes, axes, rank)):
-        if later in dropped or earlier in dropped:
+        if later in repeats or earlier in repeats:
             continue
         limit = NEAR if seen[later] == seen[earlier] else NEAR_ACROSS_HALVES
         reach = limit * (shapes[later].spacing + shapes[earlier].spacing) / 2
@@ -69,9 +69,9 @@ def drop_duplicates(
             if apart[pose] > _PROBE_SLACK * reach:
                 break
             if mean_nearest(moved[pose], shapes[earlier].points) < reach:
-                dropped[later] = earlier
+                repeats[later] = earlier
                 break
-    return dropped
+    return repeats
 
 
 def _candidates(

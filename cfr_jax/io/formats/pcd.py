@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from cfr_jax.io.cloud import CloudFileError, PointCloud, as_float64, usable_normals
+from cfr_jax.io.cloud import CloudFileError, PointCloud, as_float64, cloud_of_filled
 from cfr_jax.io.formats.ascii import Lines, clean_text
 from cfr_jax.io.formats.lzf import LARGEST_RATIO, decompress
 
@@ -47,7 +47,7 @@ def parse(data: bytes, name: str) -> PointCloud:
     """x, y, z and, if there, normal_x, normal_y, normal_z.
 
     Rows with a NaN in x, y or z are the empty cells of an organized cloud: they are left out and
-    counted in `dropped`. VIEWPOINT is not applied: points stay in the sensor's frame.
+    counted in `left_out`. VIEWPOINT is not applied: points stay in the sensor's frame.
     """
     header = _parse_header(data)
     if header.storage == "ascii":
@@ -57,15 +57,10 @@ def parse(data: bytes, name: str) -> PointCloud:
     else:
         columns = _read_compressed(data, header)
     points = np.column_stack([as_float64(columns[axis]) for axis in _POINTS])
-    filled = ~np.isnan(points).any(axis=1)
-    dropped = len(points) - int(np.count_nonzero(filled))
-    if dropped and dropped == len(points):
-        raise CloudFileError(f"all {dropped} points are NaN, wanted at least one that is not")
     normals = None
-    if len(points) and all(axis in columns for axis in _NORMALS):
-        candidate = np.column_stack([as_float64(columns[axis]) for axis in _NORMALS])
-        normals = usable_normals(candidate[filled] if dropped else candidate)
-    return PointCloud(points[filled] if dropped else points, normals, name, dropped)
+    if all(axis in columns for axis in _NORMALS):
+        normals = np.column_stack([as_float64(columns[axis]) for axis in _NORMALS])
+    return cloud_of_filled(points, normals, name)
 
 
 def _parse_header(data: bytes) -> _Header:
