@@ -42,7 +42,7 @@ from cfr_jax.data.protocol import (
 )
 from cfr_jax.evaluation import metrics
 from cfr_jax.networks import calibration
-from cfr_jax.networks.cfr.registration import prepare, register
+from cfr_jax.networks.cfr.registration import register
 from cfr_jax.networks.clues import NetworkClues
 from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.weights.files import load_params
@@ -114,7 +114,7 @@ def _row(corpus, number, rng):
 
 @jax.jit
 def _register(params, source, target):
-    clouds = (prepare(**cloud, settings=SETTINGS) for cloud in (source, target))
+    clouds = source.prepared(), target.prepared()
     return register(params, *clouds, settings=SETTINGS)
 
 

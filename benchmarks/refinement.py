@@ -18,12 +18,11 @@ import tqdm
 
 from cfr_jax.alignment import solving
 from cfr_jax.alignment.align import align
-from cfr_jax.alignment.planning import SETTINGS, planned
+from cfr_jax.alignment.planning import planned
 from cfr_jax.cli.shared.cache import keep_compiled_programs
 from cfr_jax.data.corpus import read_corpus
 from cfr_jax.data.protocol import fixed_pair, partial
 from cfr_jax.evaluation import metrics
-from cfr_jax.networks.cfr.registration import prepare
 from cfr_jax.refine import generalized_icp
 
 _BASIN = 15.0, 0.3
@@ -31,7 +30,7 @@ _BASIN = 15.0, 0.3
 
 @jax.jit
 def _ends(source, target, network, truth):
-    surfaces = [solving.surface(prepare(**cloud, settings=SETTINGS)) for cloud in (source, target)]
+    surfaces = [solving.surface(cloud.prepared()) for cloud in (source, target)]
     return {
         "network": generalized_icp.refine(*surfaces, network).transform,
         "truth": generalized_icp.descend(*surfaces, truth)[0],

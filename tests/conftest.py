@@ -27,7 +27,7 @@ def pytest_configure(config):
 def pytest_sessionstart():
     # The fields of a result state the shapes of one pair. Coming out of vmap or a scan it is made
     # anew, with one more axis in front or with placeholders, and that is no mistake.
-    from cfr_jax.alignment import confidence, quality, solving
+    from cfr_jax.alignment import case, confidence, quality, solving
     from cfr_jax.networks import sinkhorn
     from cfr_jax.networks.cfr import registration
     from cfr_jax.networks.clues import NetworkClues
@@ -42,7 +42,8 @@ def pytest_sessionstart():
         sinkhorn.Affinity,
         quality.Quality,
         confidence.Clues,
-        solving.Found,
+        solving.DeviceCloud,
+        case.Found,
         losses.PairLoss,
         TrainState,
     ):

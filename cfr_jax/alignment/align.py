@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from cfr_jax.alignment import pyramid, search, solving
 from cfr_jax.alignment.answers import Alignment, answer
-from cfr_jax.alignment.planning import planned, read_clouds, rigid_motions
+from cfr_jax.alignment.case import Case
+from cfr_jax.alignment.planning import Plan, planned
+from cfr_jax.alignment.refining import refine_every_point, refine_used_points
+from cfr_jax.alignment.search import search
 from cfr_jax.alignment.second_look import look_again
-from cfr_jax.refine import generalized_icp, small_gicp
-from cfr_jax.runtime.optional import require
+from cfr_jax.alignment.solving import solve_case
+from cfr_jax.refine import Refinement, find
 from cfr_jax.weights.files import load_params
-
-Initial = Float[np.ndarray, "4 4"] | Float[np.ndarray, "k 4 4"] | Literal["global"] | None
 
 
 def align(
@@ -27,7 +26,7 @@ def align(
     target: Any,
     *,
     params: dict | None = None,
-    refine: bool | Literal["small_gicp"] = True,
+    refine: bool | str = True,
     initial: Float[np.ndarray, "4 4"]
     | Float[np.ndarray, "k 4 4"]
     | Literal["global"]
@@ -42,10 +41,10 @@ def align(
     Clouds are (n, 3) arrays, (n, 6) with normals, paths, or what else `io.as_point_cloud` takes.
     They are centered and scaled in float64, thinned to `max_points` each (default 1,024; `seed`
     says which), given normals where they have none, registered by the network with `params`
-    (default: the weights that ship) in two cascades, and refined by our generalized ICP, by the
-    library small_gicp (`refine="small_gicp"`), or not at all (False). Refining never makes the
-    score worse. With `all_points` it is refined further on every point there is (`pyramid`);
-    `fitness` and `inlier_rmse` are then of all points, too.
+    (default: the weights that ship) in two cascades, and refined by our generalized ICP, by another
+    way that `cfr_jax.refine` knows by name (`refine="small_gicp"`), or not at all (False). Refining
+    never makes the score worse. With `all_points` it is refined further on every point there is
+    (`refine.pyramid`); `fitness` and `inlier_rmse` are then of all points, too.
 
     `initial` (4, 4) moves the source close to the target first; without it the centroids are laid
     on each other. The network is trained for up to 45 degrees about each axis from there. Several
@@ -61,54 +60,46 @@ def align(
     `io.CloudFileError` for files; ModuleNotFoundError for small_gicp without that library.
     """
     began = time.perf_counter()
-    if refine not in (True, False, "small_gicp"):
-        raise ValueError(f'refine: got {refine!r}, wanted True, False or "small_gicp"')
-    if refine == "small_gicp":
-        require("small_gicp")  # before anything is computed
-    if all_points and not refine:
-        raise ValueError(
-            "all_points: got True with refine=False, wanted a refinement to go on from"
+    refinements = chosen_refinements(refine, all_points=all_points)
+    whole = any(each.every_point for each in refinements)
+    plan = planned(source, target, initial=initial, max_points=max_points, seed=seed, whole=whole)
+    case = Case(checked_params(params), plan)
+    for step in steps(plan, refinements, second_look=second_look):
+        case = step(case)
+    case.seconds["total"] = time.perf_counter() - began
+    return answer(case)
+
+
+def chosen_refinements(refine: bool | str, *, all_points: bool = False) -> tuple[Refinement, ...]:
+    """The refinements that `align` takes one after the other, their libraries there."""
+    first = find(refine)
+    if first is None:
+        if all_points:
+            raise ValueError(
+                "all_points: got True with refine=False, wanted a refinement to go on from"
+            )
+        return ()
+    last = find("pyramid") if all_points and not first.every_point else None
+    chosen = tuple(each for each in (first, last) if each is not None)
+    for each in chosen:
+        each.require()  # before anything is computed
+    return chosen
+
+
+def steps(
+    plan: Plan, refinements: tuple[Refinement, ...], *, second_look: bool
+) -> Iterator[Callable[[Case], Case]]:
+    """The way of a plan to its answer: each step takes the case as the one before it left it."""
+    traced = refinements[0] if refinements and refinements[0].traceable else None
+    if plan.starts is not None:
+        yield search
+    yield functools.partial(solve_case, refine=traced)
+    if second_look and traced is not None and plan.starts is None:
+        yield functools.partial(look_again, refine=traced)
+    for each in refinements[traced is not None :]:
+        yield functools.partial(
+            refine_every_point if each.every_point else refine_used_points, refine=each
         )
-    source, target = read_clouds(source, target)
-    params = checked_params(params)
-    seconds = {"compile": 0.0, "run": 0.0}
-    thinned = {"max_points": max_points, "seed": seed}
-    searched = None
-    everywhere = isinstance(initial, str) and initial == "global"
-    motions = None if initial is None or everywhere else rigid_motions(initial)
-    several = everywhere or (motions is not None and len(motions) > 1)
-    plan = planned(source, target, initial=None if several else initial, **thinned)
-    if several:
-        starts = search.everywhere() if everywhere else search.given(plan.frames, motions)
-        searched = search.search(params, plan, starts, seconds=seconds)
-        plan = plan.started_at(searched.unit_motions[0])
-    arguments = params, solving.on_device(plan.source), solving.on_device(plan.target)
-    solved = solving.timed(seconds, solving.solve_pair, *arguments, refine=refine is True)
-    if refine is True and second_look and not several:
-        plan, solved, searched = look_again(params, plan, solved, seconds=seconds)
-    if refine == "small_gicp":
-        solved = _by_small_gicp(plan, arguments[1:], solved, seconds)
-    if all_points:
-        further = time.perf_counter()
-        solved = pyramid.on_all_points(plan, source, target, solved)
-        seconds["run"] += time.perf_counter() - further
-    seconds["total"] = time.perf_counter() - began
-    return answer(plan, solved, seconds, searched)
-
-
-def _by_small_gicp(plan, clouds, solved, seconds):
-    began = time.perf_counter()
-    source, target = (
-        unit.points[unit.mask].astype(np.float64) for unit in (plan.source, plan.target)
-    )
-    start = np.asarray(solved.transform, np.float64)
-    cuts = tuple(stage.cut for stage in generalized_icp.STAGES)
-    found = small_gicp.descend(source, target, start, cuts)
-    seconds["run"] += time.perf_counter() - began
-    told = jnp.asarray(found.motion, jnp.float32), jnp.array(found.converged)
-    return solving.timed(
-        seconds, solving.replaced, *clouds, solved, *told, jnp.array(found.steps, jnp.int32)
-    )
 
 
 def checked_params(params: Any) -> Mapping:

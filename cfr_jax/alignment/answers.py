@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from cfr_jax.alignment import confidence, doubts, quality, solving
-from cfr_jax.alignment.planning import Plan
-from cfr_jax.alignment.search import Search
+from cfr_jax.alignment import confidence, doubts, quality, search, solving
+from cfr_jax.alignment.case import Case
 
 
 @dataclass(frozen=True)
@@ -88,18 +87,14 @@ class Alignment:
         return result
 
 
-def answer(
-    plan: Plan, found: solving.Found, seconds: dict[str, float], searched: Search | None = None
-) -> Alignment:
-    """What the device found of a plan, in the caller's frame and units, and how far to trust it.
-
-    `searched` is the search that the plan's start came from, if there was one.
-    """
+def answer(case: Case) -> Alignment:
+    """What was found of a case, in the caller's frame and units, and how far to trust it."""
+    plan, found, searched = case.plan, case.solved(), case.searched
     frames = plan.frames
     transform = frames.to_caller(np.asarray(found.transform))
     initial = None if np.array_equal(frames.initial, np.eye(4)) else frames.initial
     far = None if searched is None or searched.nearby else searched
-    rivals = np.zeros((0, 4, 4)) if far is None else far.rivals(transform)
+    rivals = np.zeros((0, 4, 4)) if far is None else search.rivals(far, transform)
     resistance = np.asarray(found.quality.resistance)
     determined = bool(resistance.min() >= doubts.FREE)
     weakest = np.asarray(found.quality.weakest)[resistance.argmin()]
@@ -132,7 +127,7 @@ def answer(
             frames.size_ratio,
             far is not None,
         ),
-        seconds=seconds,
+        seconds=case.seconds,
         initial=initial,
         starts=1 if searched is None else searched.starts,
         alternatives=rivals,

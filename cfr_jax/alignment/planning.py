@@ -6,11 +6,12 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from cfr_jax.alignment import starts
 from cfr_jax.geometry import motions, units
 from cfr_jax.io import PointCloud, as_point_cloud
 from cfr_jax.networks.inputs import Settings
@@ -20,9 +21,12 @@ SETTINGS = Settings()
 CASCADES = 2  # chosen on validation pairs (docs/training.md)
 
 
+Initial = Float[np.ndarray, "4 4"] | Float[np.ndarray, "k 4 4"] | Literal["global"] | None
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What `align` does before the device is asked."""
+    """A pair made ready for the device."""
 
     frames: units.Frames
     source: units.UnitCloud
@@ -30,6 +34,11 @@ class Plan:
     seed: int = 0
     start_given: bool = False
     """Whether somebody said where the source starts; else centroid lies on centroid."""
+    starts: Float[np.ndarray, "s 4 4"] | None = None
+    """Motions of unit clouds to start from, of which a search takes the best; None where the one
+    start that there is has been made part of `frames`."""
+    whole: tuple[PointCloud, PointCloud] | None = None
+    """The caller's clouds with all their points, where they are asked for."""
 
     def started_at(self, motion: Float[np.ndarray, "4 4"]) -> Plan:
         """The same clouds, the source moved by `motion` of unit clouds first."""
@@ -46,7 +55,7 @@ class Plan:
             source_center=self.frames.target_center,
             initial=self.frames.to_caller(motion),
         )
-        return Plan(frames, moved, self.target, self.seed, start_given=True)
+        return dataclasses.replace(self, frames=frames, source=moved, start_given=True, starts=None)
 
 
 def read_clouds(source: Any, target: Any) -> tuple[PointCloud, PointCloud]:
@@ -62,25 +71,32 @@ def planned(
     source: Any,
     target: Any,
     *,
-    initial: Float[np.ndarray, "4 4"] | None = None,
+    initial: Initial = None,
     max_points: int | None = None,
     seed: int = 0,
+    whole: bool = False,
     settings: Settings = SETTINGS,
     to_unit: Callable[..., units.UnitCloud] = units.to_unit,
 ) -> Plan:
     """Reads, centers, scales and thins a pair; arguments and errors are those of `align`.
 
-    `to_unit` may stand in for `units.to_unit`, and remember what it made.
+    The plan keeps the `whole` clouds on demand. `to_unit` may stand in for `units.to_unit`, and
+    remember what it made.
     """
     source, target = read_clouds(source, target)
-    if initial is not None:
-        given = rigid_motions(initial)
-        if len(given) > 1:
-            raise ValueError(f"initial: got {len(given)} motions, wanted one")
-        initial = given[0]
-    budget = DEFAULT_BUDGET if max_points is None else whole("max_points", max_points, least=3)
-    seed = whole("seed", seed, least=0)
-    frames = units.unit_frames(source, target, initial)
+    everywhere = isinstance(initial, str) and initial == "global"
+    given = None if initial is None or everywhere else rigid_motions(initial)
+    start = given[0] if given is not None and len(given) == 1 else None
+    budget = DEFAULT_BUDGET
+    if max_points is not None:
+        budget = whole_number("max_points", max_points, least=3)
+    seed = whole_number("seed", seed, least=0)
+    frames = units.unit_frames(source, target, start)
+    several = None
+    if everywhere:
+        several = starts.everywhere()
+    elif given is not None and start is None:
+        several = starts.given(frames, given)
     made = (
         to_unit(
             cloud,
@@ -97,10 +113,17 @@ def planned(
             (target, frames.target_center, np.eye(4)),
         )
     )
-    return Plan(frames, *made, seed, start_given=initial is not None)
+    return Plan(
+        frames,
+        *made,
+        seed,
+        start_given=start is not None,
+        starts=several,
+        whole=(source, target) if whole else None,
+    )
 
 
-def whole(name: str, value: Any, *, least: int) -> int:
+def whole_number(name: str, value: Any, *, least: int) -> int:
     """`value` if it is a whole number of at least `least`; else a ValueError with the name."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise ValueError(f"{name}: got {value!r}, wanted a whole number of at least {least}")

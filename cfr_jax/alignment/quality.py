@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cfr_jax.geometry import rigid
 from cfr_jax.geometry.neighbors import closest
-from cfr_jax.refine.generalized_icp import Surface
+from cfr_jax.refine.surfaces import Surface
 
 _HIGHEST = lax.Precision.HIGHEST
 _NUDGE = 0.15  # radians and units of the unit sphere; three times the usual inlier distance

@@ -7,9 +7,8 @@ of them ended is told by how well the clouds then lie on each other, never by th
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-import itertools
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +18,14 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from cfr_jax.alignment import planning, quality
-from cfr_jax.alignment.solving import on_device, surface, timed
-from cfr_jax.geometry import motions, rigid, units
+from cfr_jax.alignment.case import Case, Search
+from cfr_jax.alignment.solving import DeviceCloud, on_device, surface, timed
+from cfr_jax.geometry import rigid, units
 from cfr_jax.networks.cfr.registration import encode, register
-from cfr_jax.networks.inputs import Settings, moved_by, prepare
+from cfr_jax.networks.inputs import Settings, moved_by
 from cfr_jax.refine import generalized_icp
 from cfr_jax.runtime import programs
 
-STARTS = 128  # no rotation is farther than 46 degrees from one of them, and most within 24
 COARSE = Settings(neighbors=24)
 COARSE_POINTS = 256
 KEPT = 4
@@ -37,29 +36,6 @@ _SAME_PLACE = 0.2
 RIVAL = 0.95  # of the best fit: so near, the shapes alone do not say which is right
 _COARSE_REACH = 0.1
 _FULL_REACH = generalized_icp.CUT
-
-
-@dataclass(frozen=True, eq=False)
-class Search:
-    """What was found; motions map source onto target, the best first."""
-
-    unit_motions: Float[np.ndarray, "k 4 4"]
-    """Of the unit clouds of the plan."""
-    motions: Float[np.ndarray, "k 4 4"]
-    """Of the caller's clouds."""
-    fits: Float[np.ndarray, " k"]
-    """`quality.mutual_fit` of each, on the full clouds; never rising."""
-    frames: units.Frames
-    starts: int
-    """How many were tried."""
-    nearby: bool = False
-    """Whether only starts around where the source lay were."""
-
-    def rivals(self, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "a 4 4"]:
-        """Motions that differ from `transform` and fit about as well as the best."""
-        unit, mine = self.frames.to_unit(self.motions), self.frames.to_unit(transform)
-        near = np.array([bool(same(*jnp.array([mine, other], jnp.float32))) for other in unit])
-        return self.motions[(self.fits >= RIVAL * self.fits[0]) & ~near]
 
 
 @struct.dataclass
@@ -76,8 +52,8 @@ programs.storable(Candidates)
 @functools.partial(jax.jit, static_argnames=("kept", "at_once"))
 def propose(
     params: dict,
-    source: dict[str, Array],
-    target: dict[str, Array],
+    source: DeviceCloud,
+    target: DeviceCloud,
     starts: Float[Array, "s 4 4"],
     *,
     kept: int = KEPT,
@@ -88,12 +64,12 @@ def propose(
     `at_once` starts go through the network together (`vmap`); the target is encoded once. Where
     fewer than `kept` differ, the rest have a fit of -1.
     """
-    source, target = (prepare(**cloud, settings=COARSE) for cloud in (source, target))
-    encoded = encode(params, target, settings=COARSE)
-    surfaces = surface(source), surface(target)
+    sides = source.prepared(COARSE), target.prepared(COARSE)
+    encoded = encode(params, sides[1], settings=COARSE)
+    surfaces = surface(sides[0]), surface(sides[1])
 
     def end(start):
-        found = register(params, moved_by(start, source), encoded, settings=COARSE)
+        found = register(params, moved_by(start, sides[0]), encoded, settings=COARSE)
         motion = rigid.compose(found.transform, start)
         return motion, quality.mutual_fit(*surfaces, motion, _COARSE_REACH)
 
@@ -102,54 +78,28 @@ def propose(
 
 
 @jax.jit
-def polish(source: dict[str, Array], target: dict[str, Array], motions: Array) -> Candidates:
+def polish(source: DeviceCloud, target: DeviceCloud, found: Float[Array, "k 4 4"]) -> Candidates:
     """Refines each motion on the full clouds, and puts what fits best first."""
-    surfaces = [surface(prepare(**cloud, settings=planning.SETTINGS)) for cloud in (source, target)]
+    surfaces = [surface(cloud.prepared(planning.SETTINGS)) for cloud in (source, target)]
 
     def refine(motion):
         refined = generalized_icp.refine(*surfaces, motion).transform
         return refined, quality.mutual_fit(*surfaces, refined, _FULL_REACH)
 
-    return _distinct(*lax.map(refine, motions), len(motions))
+    return _distinct(*lax.map(refine, found), len(found))
 
 
-def everywhere() -> Float[np.ndarray, "s 4 4"]:
-    """Starts of unit clouds that cover all rotations, centroid on centroid."""
-    return motions.motion(motions.cover(STARTS))
+def search(case: Case) -> Case:
+    """The plan started where its source comes to lie best on its target, of all `plan.starts`."""
+    assert case.plan.starts is not None
+    searched = tried(case, case.plan.starts)
+    plan = case.plan.started_at(searched.unit_motions[0])
+    return dataclasses.replace(case, plan=plan, searched=searched)
 
 
-def around() -> Float[np.ndarray, "s 4 4"]:
-    """Starts of unit clouds around the one where they lie, for a second look: that one, and turns
-    about six axes by 40 and about the eight between them by 50 degrees."""
-    axes = np.concatenate([np.eye(3), -np.eye(3)])
-    between = np.array(list(itertools.product((1, -1), repeat=3))) / np.sqrt(3)
-    turns = np.concatenate([np.zeros((1, 3)), 40 * axes, 50 * between])
-    return motions.motion(motions.from_rotvec(np.radians(turns)))
-
-
-def given(frames: units.Frames, starts: Float[np.ndarray, "s 4 4"]) -> Float[np.ndarray, "s 4 4"]:
-    """Starts of the caller's clouds as those of unit clouds. Raises ValueError as `align` does."""
-    unit_starts = frames.to_unit(starts)
-    away = np.abs(unit_starts[:, :3, 3]).max(axis=1)
-    if away.max() > units.FARTHEST:
-        raise ValueError(
-            f"initial: number {away.argmax()} leaves the source {away.max():.3g} radii away "
-            f"from the target, wanted at most {units.FARTHEST:g}"
-        )
-    return unit_starts
-
-
-def search(
-    params: dict,
-    plan: planning.Plan,
-    starts: Float[np.ndarray, "s 4 4"],
-    *,
-    seconds: dict[str, float],
-) -> Search:
-    """The best motions of the plan's source onto its target from all `starts` of unit clouds.
-
-    Adds its time to `seconds`, as `solving.timed` does.
-    """
+def tried(case: Case, starts: Float[np.ndarray, "s 4 4"], *, nearby: bool = False) -> Search:
+    """The best motions of the case's source onto its target from all `starts` of unit clouds."""
+    plan = case.plan
     at_once = 1 if jax.default_backend() == "cpu" else _AT_ONCE
     coarse = (
         units.thinned(
@@ -161,10 +111,10 @@ def search(
         )
         for unit in (plan.source, plan.target)
     )
-    arguments = (params, *map(on_device, coarse), jnp.asarray(starts, jnp.float32))
-    proposed = timed(seconds, propose, *arguments, at_once=at_once)
+    arguments = (case.params, *map(on_device, coarse), jnp.asarray(starts, jnp.float32))
+    proposed = timed(case.seconds, propose, *arguments, at_once=at_once)
     whole = on_device(plan.source), on_device(plan.target)
-    found = timed(seconds, polish, *whole, proposed.motions)
+    found = timed(case.seconds, polish, *whole, proposed.motions)
     real = np.asarray(found.fits) >= 0
     unit_motions = np.asarray(found.motions, np.float64)[real]
     return Search(
@@ -173,7 +123,16 @@ def search(
         fits=np.asarray(found.fits, np.float64)[real],
         frames=plan.frames,
         starts=len(starts),
+        nearby=nearby,
     )
+
+
+def rivals(searched: Search, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "a 4 4"]:
+    """Motions that differ from `transform` and fit about as well as the best."""
+    frames, fits = searched.frames, searched.fits
+    unit, mine = frames.to_unit(searched.motions), frames.to_unit(transform)
+    near = np.array([bool(same(*jnp.array([mine, other], jnp.float32))) for other in unit])
+    return searched.motions[(fits >= RIVAL * fits[0]) & ~near]
 
 
 def same(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Array:

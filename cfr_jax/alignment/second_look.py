@@ -9,30 +9,25 @@ from __future__ import annotations
 
 import dataclasses
 
-from cfr_jax.alignment import confidence, doubts, solving
-from cfr_jax.alignment.planning import Plan
-from cfr_jax.alignment.search import Search, around, search
+from cfr_jax.alignment import confidence, doubts, search, solving, starts
+from cfr_jax.alignment.case import Case, Found
+from cfr_jax.refine import Refinement
 
 
-def look_again(
-    params: dict, plan: Plan, found: solving.Found, *, seconds: dict[str, float]
-) -> tuple[Plan, solving.Found, Search | None]:
-    """What was found of a plan, or from another start what is more likely to be right.
+def look_again(case: Case, *, refine: Refinement | None) -> Case:
+    """The case as it is, or solved from another start where that is more likely to be right.
 
     Nothing is tried where the answer is trusted, or where somebody said where the source starts.
-    Adds its time to `seconds`, as `solving.timed` does.
     """
-    first = _confidence(found)
-    if plan.start_given or first >= doubts.TRUSTED:
-        return plan, found, None
-    searched = dataclasses.replace(search(params, plan, around(), seconds=seconds), nearby=True)
-    other = plan.started_at(searched.unit_motions[0])
-    clouds = solving.on_device(other.source), solving.on_device(other.target)
-    again = solving.timed(seconds, solving.solve_pair, params, *clouds, refine=True)
-    if _confidence(again) > first:
-        return other, again, searched
-    return plan, found, searched
+    first = _confidence(case.solved())
+    if case.plan.start_given or first >= doubts.TRUSTED:
+        return case
+    searched = search.tried(case, starts.around(), nearby=True)
+    case = dataclasses.replace(case, searched=searched)
+    other = dataclasses.replace(case, plan=case.plan.started_at(searched.unit_motions[0]))
+    again = solving.solve_case(other, refine=refine)
+    return again if _confidence(again.solved()) > first else case
 
 
-def _confidence(found):
+def _confidence(found: Found) -> float:
     return doubts.probability(confidence.named(found.clues), float(found.quality.fitness))

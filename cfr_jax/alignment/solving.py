@@ -5,9 +5,10 @@ Pure functions of one pair of unit clouds; batches are `vmap`.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -17,35 +18,36 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from cfr_jax.alignment import confidence, quality
+from cfr_jax.alignment.case import Case, Found
 from cfr_jax.alignment.planning import CASCADES, SETTINGS
 from cfr_jax.geometry.units import UnitCloud
 from cfr_jax.networks.cfr.iterations import Encoded
 from cfr_jax.networks.cfr.registration import Registration, encode, register
 from cfr_jax.networks.clues import NetworkClues
-from cfr_jax.networks.inputs import Cloud, prepare
-from cfr_jax.refine import generalized_icp
-from cfr_jax.refine.generalized_icp import Surface, score
+from cfr_jax.networks.inputs import Cloud, Settings, prepare
+from cfr_jax.refine import Refinement, generalized_icp
+from cfr_jax.refine.generalized_icp import score
+from cfr_jax.refine.surfaces import Surface
 from cfr_jax.runtime import programs
 
 DISTANCE = generalized_icp.CUT
 
 
 @struct.dataclass
-class Found:
-    """What comes back from the device; batched after `vmap`."""
+class DeviceCloud:
+    """A unit cloud on the device, with neighbors, and with normals if the caller gave some."""
 
-    registration: Registration
-    transform: Float[Array, "*batch 4 4"]
-    """Maps the source, as it was handed over, onto the target."""
-    improved: Bool[Array, "*batch"]
-    """Whether `transform` is not the network's last, but one that fits no worse."""
-    converged: Bool[Array, "*batch"]
-    steps: Int[Array, "*batch"]
-    quality: quality.Quality
-    clues: confidence.Clues
+    points: Float[Array, "*batch n c"]
+    neighbors: Int[Array, "*batch n k"]
+    mask: Bool[Array, "*batch n"]
+
+    def prepared(self, settings: Settings = SETTINGS) -> Cloud:
+        """As the network takes it."""
+        return prepare(self.points, neighbors=self.neighbors, mask=self.mask, settings=settings)
 
 
 programs.storable(
+    DeviceCloud,
     Cloud,
     Encoded,
     Registration,
@@ -56,7 +58,7 @@ programs.storable(
 )
 
 
-def solve(params: dict, source: Cloud, target: Encoded, *, refine: bool) -> Found:
+def solve(params: Mapping, source: Cloud, target: Encoded, *, refine: Refinement | None) -> Found:
     """The device's part for one pair of unit clouds: registered, refined, judged.
 
     Refining never answers worse, by its own score, than the network did or than the source lay
@@ -67,8 +69,8 @@ def solve(params: dict, source: Cloud, target: Encoded, *, refine: bool) -> Foun
     transform = registration.transform
     improved = converged = jnp.array(False)
     steps = jnp.zeros((), jnp.int32)
-    if refine:
-        refined = generalized_icp.refine(*surfaces, transform)
+    if refine is not None:
+        refined = refine(*surfaces, transform)
         start = jnp.eye(4, dtype=transform.dtype)
         kept, moved = (score(*surfaces, motion, DISTANCE) for motion in (start, refined.transform))
         stays = kept < moved
@@ -81,20 +83,20 @@ def solve(params: dict, source: Cloud, target: Encoded, *, refine: bool) -> Foun
 
 @jax.jit
 def replaced(
-    source: dict[str, jax.Array],
-    target: dict[str, jax.Array],
+    source: DeviceCloud,
+    target: DeviceCloud,
     found: Found,
     transform: Float[Array, "4 4"],
     converged: Bool[Array, ""],
     steps: Int[Array, ""],
 ) -> Found:
     """`found` with another refinement's `transform` instead, unless that fits worse."""
-    source, target = (prepare(**cloud, settings=SETTINGS) for cloud in (source, target))
-    surfaces = surface(source), surface(target)
+    cloud = target.prepared()
+    surfaces = surface(source.prepared()), surface(cloud)
     before, after = (score(*surfaces, motion, DISTANCE) for motion in (found.transform, transform))
     improved = after <= before
     transform = jnp.where(improved, transform, found.transform)
-    measured, clues = _judge(found.registration, transform, target, surfaces)
+    measured, clues = _judge(found.registration, transform, cloud, surfaces)
     return Found(found.registration, transform, improved, converged, steps, measured, clues)
 
 
@@ -112,20 +114,27 @@ def surface(cloud: Cloud) -> Surface:
     return Surface(cloud.points, cloud.normals, mask)
 
 
-def on_device(unit: UnitCloud) -> dict[str, jax.Array]:
-    """The arguments of `prepared.prepare` for a unit cloud."""
+def on_device(unit: UnitCloud) -> DeviceCloud:
+    """A unit cloud, sent to the device."""
     points = unit.points if unit.normals is None else np.hstack([unit.points, unit.normals])
     # not jnp.asarray, which compiles a copy of each shape
-    return jax.device_put({"points": points, "neighbors": unit.neighbors, "mask": unit.mask})
+    return DeviceCloud(*jax.device_put((points, unit.neighbors, unit.mask)))
 
 
 @functools.partial(jax.jit, static_argnames=("refine",))
 def solve_pair(
-    params: dict, source: dict[str, jax.Array], target: dict[str, jax.Array], *, refine: bool
+    params: Mapping, source: DeviceCloud, target: DeviceCloud, *, refine: Refinement | None
 ) -> Found:
     """`solve` for two clouds as `on_device` hands them over."""
-    source, target = (prepare(**cloud, settings=SETTINGS) for cloud in (source, target))
-    return solve(params, source, encode(params, target, settings=SETTINGS), refine=refine)
+    encoded = encode(params, target.prepared(), settings=SETTINGS)
+    return solve(params, source.prepared(), encoded, refine=refine)
+
+
+def solve_case(case: Case, *, refine: Refinement | None) -> Case:
+    """The case with what the network finds of its plan, refined by what JAX can trace."""
+    sides = on_device(case.plan.source), on_device(case.plan.target)
+    found = timed(case.seconds, solve_pair, case.params, *sides, refine=refine)
+    return dataclasses.replace(case, found=found)
 
 
 def timed(seconds: dict[str, float], function: Callable, *arguments: Any, **static: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -14,13 +14,14 @@ import numpy as np
 
 from cfr_jax.alignment import solving
 from cfr_jax.alignment.answers import Alignment, answer
+from cfr_jax.alignment.case import Case, Found
 from cfr_jax.alignment.planning import SETTINGS, Plan
 from cfr_jax.alignment.second_look import look_again
 from cfr_jax.batch.memo import Memo
 from cfr_jax.geometry.units import UnitCloud
 from cfr_jax.networks.cfr.iterations import Encoded
 from cfr_jax.networks.cfr.registration import encode
-from cfr_jax.networks.inputs import prepare
+from cfr_jax.refine import Refinement
 from cfr_jax.runtime import programs
 
 _KEPT = 32  # encoded targets, about 2 MB each
@@ -29,9 +30,9 @@ _KEPT = 32  # encoded targets, about 2 MB each
 class Device:
     """What runs on the accelerator, with the targets it has encoded lately."""
 
-    def __init__(self, params: dict, refine: bool, second_look: bool, size: int):
+    def __init__(self, params: Mapping, refine: Refinement | None, second_look: bool, size: int):
         self._params, self._refine, self.size = params, refine, size
-        self._second_look = refine and second_look
+        self._second_look = refine is not None and second_look
         self._encoded = Memo(_KEPT)
 
     def solve(self, plans: Sequence[Plan]) -> list[Alignment]:
@@ -57,15 +58,14 @@ class Device:
             for row, plan in enumerate(plans)
         ]
 
-    def _answer(self, plan: Plan, found: solving.Found, seconds: dict[str, float]) -> Alignment:
+    def _answer(self, plan: Plan, found: Found, seconds: dict[str, float]) -> Alignment:
         """After a second look where there is doubt; those pairs are few, and looked at singly."""
-        searched = None
+        case = Case(self._params, plan, found, seconds=dict(seconds))
         if self._second_look:
             began = time.perf_counter()
-            seconds = dict(seconds)
-            plan, found, searched = look_again(self._params, plan, found, seconds=seconds)
-            seconds["total"] += time.perf_counter() - began
-        return answer(plan, found, seconds, searched)
+            case = look_again(case, refine=self._refine)
+            case.seconds["total"] += time.perf_counter() - began
+        return answer(case)
 
     def _encode(self, target: UnitCloud) -> tuple[Encoded, float]:
         """The features of a target, and how long their program took to compile."""
@@ -91,23 +91,23 @@ def signature(plan: Plan) -> tuple:
 
 
 @jax.jit
-def encode_target(params: dict, target: dict[str, jax.Array]) -> Encoded:
+def encode_target(params: Mapping, target: solving.DeviceCloud) -> Encoded:
     """The target's side of `solving.solve`, for a cloud as `solving.on_device` hands it over."""
-    return encode(params, prepare(**target, settings=SETTINGS), settings=SETTINGS)
+    return encode(params, target.prepared(), settings=SETTINGS)
 
 
 @functools.partial(jax.jit, static_argnames=("refine",))
 def solve_many(
-    params: dict,
-    sources: Sequence[dict[str, jax.Array]],
+    params: Mapping,
+    sources: Sequence[solving.DeviceCloud],
     targets: Sequence[Encoded],
     *,
-    refine: bool,
-) -> solving.Found:
+    refine: Refinement | None,
+) -> Found:
     """`solving.solve` of pairs of one size, all at once; every leaf has the pairs in front."""
 
-    def solve(source: dict[str, jax.Array], target: Encoded) -> solving.Found:
-        return solving.solve(params, prepare(**source, settings=SETTINGS), target, refine=refine)
+    def solve(source: solving.DeviceCloud, target: Encoded) -> Found:
+        return solving.solve(params, source.prepared(), target, refine=refine)
 
     def stacked(clouds: Any) -> Any:
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)

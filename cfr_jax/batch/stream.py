@@ -13,11 +13,12 @@ import jax
 
 from cfr_jax.alignment.align import checked_params
 from cfr_jax.alignment.answers import Alignment
-from cfr_jax.alignment.planning import DEFAULT_BUDGET, Plan, planned, whole
+from cfr_jax.alignment.planning import DEFAULT_BUDGET, Plan, planned, whole_number
 from cfr_jax.batch.device import Device, signature
 from cfr_jax.batch.memo import Memo
 from cfr_jax.geometry import units
 from cfr_jax.io import PointCloud, as_point_cloud
+from cfr_jax.refine import find
 
 # More pairs a call keep an accelerator busy, and a CPU's caches cold.
 ON_CPU, ON_ACCELERATOR = 1, 16
@@ -41,7 +42,7 @@ def align_many(
     pairs: Iterable[Any],
     *,
     params: dict | None = None,
-    refine: bool = True,
+    refine: bool | str = True,
     max_points: int | None = None,
     second_look: bool = True,
     seed: int = 0,
@@ -62,20 +63,29 @@ def align_many(
 
     With `ordered`, outcomes come in the order of the pairs. Otherwise they come as soon as they are
     done. The answers equal those of `align` up to float32 rounding. A `second_look` runs pair by
-    pair. If a pair cannot be read or has no answer, its outcome has an `error`, and the others
-    continue. Do not change an array before its outcome has come.
+    pair. `refine` may name any refinement that JAX can trace. If a pair cannot be read or has no
+    answer, its outcome has an `error`, and the others continue. Do not change an array before its
+    outcome has come.
 
     Raises ValueError for invalid options, before it reads any pair.
     """
-    budget = DEFAULT_BUDGET if max_points is None else whole("max_points", max_points, least=3)
-    seed = whole("seed", seed, least=0)
+    budget = DEFAULT_BUDGET
+    if max_points is not None:
+        budget = whole_number("max_points", max_points, least=3)
+    seed = whole_number("seed", seed, least=0)
     if batch is None:
         batch = ON_CPU if jax.default_backend() == "cpu" else ON_ACCELERATOR
     if workers is None:
         workers = min(4, os.cpu_count() or 1)
     params = checked_params(params)
-    device = Device(params, refine, second_look, whole("batch", batch, least=1))
-    workers = whole("workers", workers, least=1)
+    refinement = find(refine)
+    if refinement is not None and not refinement.traceable:
+        raise ValueError(
+            f"refine: got {refine!r}, which runs on the host; wanted True, False or one that JAX "
+            "can trace. `align` takes any, pair by pair"
+        )
+    device = Device(params, refinement, second_look, whole_number("batch", batch, least=1))
+    workers = whole_number("workers", workers, least=1)
     done = _done(_Planner(budget, seed), pairs, device, workers)
     return _in_order(done) if ordered else done
 
@@ -104,7 +114,12 @@ class _Planner:
             key = id(cloud), center.tobytes(), scale, motion.tobytes()
             return self._units.get(key, make)[1]
 
-        return planned(source, target, initial=initial, to_unit=to_unit, **self._options)
+        plan = planned(source, target, initial=initial, to_unit=to_unit, **self._options)
+        if plan.starts is not None:
+            raise ValueError(
+                "initial: got several starts, wanted one (4, 4); a search is for `align` alone"
+            )
+        return plan
 
 
 def _done(plan: _Planner, pairs: Iterable[Any], device: Device, workers: int) -> Iterator[Outcome]:

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from cfr_jax import refine
 from cfr_jax.cli.shared import numbers, outputs
 
 UNTRUSTED = 3
@@ -94,10 +95,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     after.add_argument(
         "--refine",
-        choices=("own", "small_gicp"),
-        default="own",
-        help="what refines it: our own generalized ICP (the default), or that of the library "
-        'small_gicp (pip install "cfr_jax[baselines]")',
+        metavar="WAY",
+        default=True,
+        help="what refines it: "
+        + "; ".join(f"{name}, {refine.refinement(name).title}" for name in refine.names())
+        + f"; or module:function (default: {refine.DEFAULT})",
     )
     how.add_argument(
         "--weights",
@@ -173,7 +175,7 @@ def run(args: argparse.Namespace) -> int:
         source,
         target,
         weights=args.weights,
-        refine="small_gicp" if args.refine == "small_gicp" else not args.no_refine,
+        refine=False if args.no_refine else args.refine,
         initial=initial,
         max_points=args.max_points,
         all_points=args.all_points,
@@ -210,8 +212,12 @@ def _check_outputs(args: argparse.Namespace, to_stdout: bool) -> None:
         outputs.check_output(option, path, suffixes)
     inputs = [path for path in (args.source, args.target, *(args.initial or ()))]
     outputs.check_apart(inputs, [path for path, _ in given.values()])
-    if args.refine == "small_gicp" and importlib.util.find_spec("small_gicp") is None:
-        raise ValueError('--refine small_gicp needs that library: pip install "cfr_jax[baselines]"')
+    chosen = refine.find(args.refine)
+    library = None if chosen is None else chosen.library
+    if library is not None and importlib.util.find_spec(library) is None:
+        raise ValueError(
+            f'--refine {args.refine} needs {library}: pip install "cfr_jax[baselines]"'
+        )
     if args.png is not None:
         outputs.check_library("--png", args.png)
 

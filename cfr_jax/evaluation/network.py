@@ -25,7 +25,7 @@ from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks import rpmnet
 from cfr_jax.networks.cfr.iterations import Step, unroll
 from cfr_jax.networks.inputs import Cloud, Settings, moved_by
-from cfr_jax.refine import generalized_icp
+from cfr_jax.refine import Refinement, find
 from cfr_jax.runtime import programs
 from cfr_jax.weights.files import load_params
 
@@ -43,7 +43,7 @@ class Program:
 
     unroll: Unroll
     settings: Any
-    refine: bool
+    refine: Refinement | None
     vectorized: int
     cascades: int = 1
 
@@ -52,7 +52,7 @@ def make_network(
     *,
     network: str,
     weights: str,
-    refine: bool,
+    refine: bool | str,
     settings: dict[str, Any] | None = None,
     through: Literal["register", "align", "preparation"] = "register",
     estimated: bool = False,
@@ -92,14 +92,17 @@ def make_network(
     if initial is not None:
         raise ValueError(f"initial is {initial!r}, which needs through='align'")
     unroll, made = KINDS[network]
-    program = Program(unroll, made(**settings or {}), refine, vectorized, cascades)
+    refinement = find(refine)
+    if refinement is not None and not refinement.traceable:
+        raise ValueError(f"refine is {refine!r}, which needs through='align'")
+    program = Program(unroll, made(**settings or {}), refinement, vectorized, cascades)
     if through == "preparation":
         return functools.partial(_prepare_each, params, program, estimated, max_points, seed)
     return functools.partial(_register_batches, params, program, estimated, batch)
 
 
 def _align_each(
-    params: dict, refine: bool, estimated: bool, pairs: Sequence[Pair], **options: Any
+    params: dict, refine: bool | str, estimated: bool, pairs: Sequence[Pair], **options: Any
 ) -> list[Answer]:
     answers = []
     for pair in pairs:
@@ -204,10 +207,10 @@ def _solve(
     def of_pair(pair):
         source, target = (_with_normals(cloud) for cloud in pair)
         transforms = _transforms(program, params, source, target)
-        if not program.refine:
+        if program.refine is None:
             return transforms
         surfaces = solving.surface(source), solving.surface(target)
-        refined = generalized_icp.refine(*surfaces, transforms[-1]).transform
+        refined = program.refine(*surfaces, transforms[-1]).transform
         return jnp.concatenate([transforms, refined[None]])
 
     size = program.vectorized if program.vectorized > 1 else None

@@ -1,1 +1,123 @@
-"""Local refinement: a motion that is nearly right, made precise."""
+"""Local refinement: a motion that is nearly right, made precise. One file per way, one table.
+
+A refinement is a function `refine(source, target, initial, **options) -> Fit`: two surfaces in the
+unit sphere and the (4, 4) motion of the source onto the target to start from (`surfaces` has the
+types). A new one is a file with such a function, and a line in the table; `add` puts one there from
+outside the package.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from cfr_jax.runtime.optional import require
+
+if TYPE_CHECKING:
+    from cfr_jax.refine.surfaces import Fit
+
+DEFAULT = "own"
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """One way to refine; called like the function it stands for."""
+
+    name: str
+    title: str
+    """What it is, for people."""
+    home: str | Callable[..., Fit]
+    """The function, or where it is, as "module:function", to be imported on first use."""
+    traceable: bool = False
+    """Whether JAX can trace it: then it becomes part of the network's program and gets `Surface`s.
+    All others run on the host and get `HostSurface`s."""
+    every_point: bool = False
+    """Whether it gets all points of the clouds, and not only those that the network saw."""
+    library: str | None = None
+    """An optional library that it needs."""
+
+    def __call__(self, source: Any, target: Any, initial: Any, **options: Any) -> Fit:
+        """The fit found from `initial`; raises ModuleNotFoundError without its library."""
+        self.require()
+        return self.function()(source, target, initial, **options)
+
+    def function(self) -> Callable[..., Fit]:
+        """The function itself."""
+        if not isinstance(self.home, str):
+            return self.home
+        module, _, name = self.home.partition(":")
+        return getattr(importlib.import_module(module), name)
+
+    def require(self) -> None:
+        """Raises ModuleNotFoundError, with the way out, where its library is missing."""
+        if self.library is not None:
+            require(self.library)
+
+
+_HERE = "cfr_jax.refine"
+_TABLE = {
+    each.name: each
+    for each in (
+        Refinement(
+            DEFAULT, "our own generalized ICP", f"{_HERE}.generalized_icp:refine", traceable=True
+        ),
+        Refinement(
+            "small_gicp",
+            "generalized ICP of the library small_gicp",
+            f"{_HERE}.small_gicp:refine",
+            library="small_gicp",
+        ),
+        Refinement(
+            "pyramid",
+            "our own generalized ICP on all points, from coarse to fine",
+            f"{_HERE}.pyramid:refine",
+            every_point=True,
+        ),
+    )
+}
+
+
+def names() -> tuple[str, ...]:
+    """The names in the table."""
+    return tuple(_TABLE)
+
+
+def add(refinement: Refinement) -> None:
+    """Puts a refinement into the table. Raises ValueError where its name is taken."""
+    if refinement.name in _TABLE or ":" in refinement.name:
+        raise ValueError(f"name: got {refinement.name!r}, wanted one that is not taken, without :")
+    _TABLE[refinement.name] = refinement
+
+
+def refinement(name: str) -> Refinement:
+    """The refinement of that name.
+
+    "module:function" is a function anywhere, which runs on the host: so commands and configs name
+    what their process has in no table. Raises ValueError for another name.
+    """
+    if isinstance(name, str) and name in _TABLE:
+        return _TABLE[name]
+    if isinstance(name, str) and ":" in name:
+        return _elsewhere(name)
+    raise ValueError(
+        f"refine: got {name!r}, wanted True, False, {', '.join(map(repr, _TABLE))}, "
+        'or "module:function"'
+    )
+
+
+def find(refine: bool | str) -> Refinement | None:
+    """The refinement that an option asks for: by name, the usual one for True, none for False."""
+    if isinstance(refine, bool):
+        return refinement(DEFAULT) if refine else None
+    return refinement(refine)
+
+
+def _elsewhere(place: str) -> Refinement:
+    found = Refinement(place, place, place)
+    try:
+        found.function()
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"refine: got {place!r}, which cannot be imported: {error}") from error
+    return found

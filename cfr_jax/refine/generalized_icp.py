@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from cfr_jax.geometry import rigid
 from cfr_jax.geometry.neighbors import closest
+from cfr_jax.refine.surfaces import Fit, Surface
 
 _HIGHEST = lax.Precision.HIGHEST
 
@@ -40,33 +40,12 @@ _STEPS_PER_CUT = 12
 _SETTLED = 1e-5  # radians and units: smaller updates end a stage
 
 
-@struct.dataclass
-class Surface:
-    """Points with normals, `mask` marking the valid rows."""
-
-    points: Float[Array, "n 3"]
-    normals: Float[Array, "n 3"]
-    mask: Bool[Array, " n"]
-
-
-@struct.dataclass
-class Refinement:
-    """Answer of `refine`."""
-
-    transform: Float[Array, "4 4"]
-    """Maps source onto target; the initial one where refining made the score worse."""
-    improved: Bool[Array, ""]
-    converged: Bool[Array, ""]
-    """Whether the last stage ended because nothing moved any more."""
-    steps: Int[Array, ""]
-
-
 def refine(
     source: Surface,
     target: Surface,
     initial: Float[Array, "4 4"],
     stages: tuple[Stage, ...] = STAGES,
-) -> Refinement:
+) -> Fit:
     """Refines `initial`, which maps source onto target, within the unit sphere.
 
     Where `descend` ends is kept only if it scores no worse than `initial` (`score` at the last
@@ -75,7 +54,7 @@ def refine(
     transform, steps, settled = descend(source, target, initial, stages)
     before, after = (score(source, target, t, stages[-1].cut) for t in (initial, transform))
     improved = after <= before
-    return Refinement(jnp.where(improved, transform, initial), improved, settled, steps)
+    return Fit(jnp.where(improved, transform, initial), improved, settled, steps)
 
 
 def descend(

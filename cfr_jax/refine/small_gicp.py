@@ -2,42 +2,45 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from cfr_jax.refine import generalized_icp
+from cfr_jax.refine.surfaces import Fit, HostSurface
 from cfr_jax.runtime.optional import require
 
-
-class Descent(NamedTuple):
-    """Where it ended, whether the last stage settled there, and how many steps all took."""
-
-    motion: Float[np.ndarray, "4 4"]
-    converged: bool
-    steps: int
+_CUTS = tuple(stage.cut for stage in generalized_icp.STAGES)
 
 
-def descend(
-    source: Float[np.ndarray, "n 3"],
-    target: Float[np.ndarray, "m 3"],
-    motion: Float[np.ndarray, "4 4"],
-    distances: tuple[float, ...],
+def refine(
+    source: HostSurface,
+    target: HostSurface,
+    initial: Float[np.ndarray, "4 4"],
+    *,
+    distances: tuple[float, ...] = _CUTS,
     neighbors: int = 20,
     iterations: int = 100,
-) -> Descent:
-    """GICP from `motion`, which maps source onto target."""
+) -> Fit:
+    """GICP from `initial`, which maps source onto target, `iterations` for each of `distances`.
+
+    Pairs further apart than the distance are rejected. The covariance of a point comes from its
+    `neighbors` nearest points; normals are not used. Whether the answer is any better than
+    `initial` is not asked.
+    """
     small_gicp = require("small_gicp")
-    clouds, trees = zip(
-        *(_with_covariances(points, neighbors) for points in (source, target)), strict=True
+    (moving, _), (cloud, tree) = (
+        surface.once(("small_gicp", neighbors), lambda s=surface: _prepared(s.points, neighbors))
+        for surface in (source, target)
     )
-    converged, steps = False, 0
+    motion, converged, steps = initial, False, 0
     for distance in distances:
         # small_gicp's usual tolerances are those of a car: 0.1 degrees and a millimeter
         found = small_gicp.align(
-            clouds[1],
-            clouds[0],
-            trees[1],
+            cloud,
+            moving,
+            tree,
             init_T_target_source=motion,
             registration_type="GICP",
             max_correspondence_distance=distance,
@@ -47,10 +50,11 @@ def descend(
         )
         motion, converged = np.array(found.T_target_source), bool(found.converged)
         steps += int(found.iterations)
-    return Descent(np.array(motion), converged, steps)
+    return Fit(np.array(motion), True, converged, steps)
 
 
-def _with_covariances(points: Float[np.ndarray, "n 3"], neighbors: int) -> tuple[Any, Any]:
+def _prepared(points: Float[np.ndarray, "n 3"], neighbors: int) -> tuple[Any, Any]:
+    """The library's cloud with covariances, and its tree."""
     small_gicp = require("small_gicp")
     cloud = small_gicp.PointCloud(points)
     tree = small_gicp.KdTree(cloud)

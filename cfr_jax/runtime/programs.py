@@ -58,7 +58,8 @@ def compiled(function: Callable, *arguments: Any, **static: Any) -> Callable:
 @functools.lru_cache(maxsize=64)
 def _program(function, static, structure, shapes):
     arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    if _places and "<" not in function.__qualname__:  # two lambdas have one name
+    # two lambdas have one name, and so have functions among the options whose code may change
+    if _places and "<" not in f"{function.__qualname__}{static}":
         name = _digest(function.__module__, function.__qualname__, static, structure, shapes)
         path = _places[0] / f"{function.__name__}-{name}.stablehlo"
         exported = _read(path)

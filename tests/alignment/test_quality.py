@@ -14,7 +14,7 @@ from cfr_jax.alignment import doubts, quality
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.geometry.units import to_unit, unit_frames
 from cfr_jax.io import PointCloud
-from cfr_jax.refine.generalized_icp import Surface
+from cfr_jax.refine.surfaces import Surface
 
 SIZE, DISTANCE, SPACING = 512, 0.05, jnp.array(0.03)
 MEASURE = jax.jit(functools.partial(quality.measure, distance=DISTANCE, spacing=SPACING))

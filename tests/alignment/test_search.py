@@ -9,11 +9,11 @@ import pytest
 import solids
 from scipy.spatial import cKDTree
 
-from cfr_jax.alignment import doubts, quality, search
+from cfr_jax.alignment import doubts, quality, search, starts
 from cfr_jax.alignment.align import align
-from cfr_jax.alignment.search import Search
+from cfr_jax.alignment.case import Search
 from cfr_jax.geometry.units import Frames
-from cfr_jax.refine.generalized_icp import Surface
+from cfr_jax.refine.surfaces import Surface
 
 FIT = jax.jit(functools.partial(quality.mutual_fit, reach=0.2))
 
@@ -22,7 +22,7 @@ FIT = jax.jit(functools.partial(quality.mutual_fit, reach=0.2))
 def few_starts(monkeypatch):
     """Fewer starts on smaller clouds: the same code, in a second."""
     monkeypatch.setattr(search, "COARSE_POINTS", 128)
-    monkeypatch.setattr(search, "STARTS", 64)
+    monkeypatch.setattr(starts, "COUNT", 64)
 
 
 def surface(sampled):
@@ -50,12 +50,12 @@ def test_a_turn_of_any_size_is_found(few_starts, degrees):
 def test_of_several_starts_the_one_near_the_truth_is_taken(few_starts):
     truth = solids.motion(150, (0, 1, 1))
     source, target = solids.two_samplings(256, truth)
-    starts = [solids.motion(angle, (1, 0, 0)) for angle in (0, 90)]
-    starts.append(solids.motion(15, (1, 1, 0), (0.03, 0, 0)) @ truth)
+    tried = [solids.motion(angle, (1, 0, 0)) for angle in (0, 90)]
+    tried.append(solids.motion(15, (1, 1, 0), (0.03, 0, 0)) @ truth)
 
     # as many as the cover has, so that they share its compiled program
-    starts = np.resize(starts, (search.STARTS, 4, 4))
-    found = align(source, target, initial=starts, max_points=256)
+    tried = np.resize(tried, (starts.COUNT, 4, 4))
+    found = align(source, target, initial=tried, max_points=256)
 
     assert solids.degrees_between(found.transform, truth) < 3
 
@@ -94,7 +94,7 @@ def test_what_fits_as_well_another_way_is_told_and_named():
     frames = Frames(np.zeros(3), np.zeros(3), 1.0, np.eye(4))
     found = Search(motions, motions, np.array([0.8, 0.79, 0.3, 0.78]), frames, 4)
 
-    rivals = found.rivals(solids.motion(3, translation=(0, 0, 0)))
+    rivals = search.rivals(found, solids.motion(3, translation=(0, 0, 0)))
 
     assert np.array_equal(rivals, np.stack([half, shifted]))
     assert doubts.turns(np.eye(4), rivals) == ("turned by 180° about (0.00, 0.00, 1.00)", "shifted")

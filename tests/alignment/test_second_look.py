@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import solids
 
-from cfr_jax.alignment import doubts, search, second_look
+from cfr_jax.alignment import doubts, search, starts
 from cfr_jax.alignment.align import align
+from cfr_jax.alignment.case import Search
 from cfr_jax.alignment.planning import planned
 from cfr_jax.batch.stream import align_many
 
@@ -29,7 +30,7 @@ def test_a_pair_turned_too_far_for_one_start_is_found(pair, looked):
     assert once.confidence < doubts.TRUSTED and solids.degrees_between(once.transform, TURN) > 20
     assert looked.confidence > doubts.TRUSTED and solids.degrees_between(looked.transform, TURN) < 3
     assert once.starts == 1 and once.initial is None
-    assert looked.starts == len(search.around()) and looked.initial is not None
+    assert looked.starts == len(starts.around()) and looked.initial is not None
     assert not len(looked.alternatives)
 
 
@@ -64,18 +65,18 @@ def test_what_is_less_likely_right_is_not_taken(pair, monkeypatch):
     half = np.array([np.diag([1.0, -1.0, -1.0, 1.0])])
     asked = []
 
-    def worse(params, plan, starts, seconds):
+    def worse(case, starts, nearby):
         asked.append(len(starts))
-        return search.Search(half, half, np.ones(1), plan.frames, len(starts))
+        return Search(half, half, np.ones(1), case.plan.frames, len(starts), nearby)
 
-    monkeypatch.setattr(second_look, "search", worse)
+    monkeypatch.setattr(search, "tried", worse)
     monkeypatch.setattr(doubts, "TRUSTED", 2.0)
 
     # when
     found = align(*easy)
 
     # then
-    assert asked == [len(search.around())]
+    assert asked == [len(starts.around())]
     assert found.confidence == once.confidence
     np.testing.assert_array_equal(found.transform, once.transform)
 

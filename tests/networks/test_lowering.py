@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from cfr_jax.alignment.solving import solve_pair
+from cfr_jax.alignment.solving import DeviceCloud, solve_pair
 from cfr_jax.networks.cfr.modules import CHANNELS, init_params
 from cfr_jax.networks.cfr.registration import Settings, encode, register
 from cfr_jax.networks.sinkhorn import Form
+from cfr_jax.refine import find
 
 N, M, K, L = 40, 48, 8, 2
 PLATFORMS = ("cuda", "tpu")
@@ -45,10 +46,9 @@ def training(params):
 
 def aligning(params):
     def cloud(n):
-        return {"points": shape(n, 3), "neighbors": shape(n, K, dtype=jnp.int32),
-                "mask": shape(n, dtype=bool)}  # fmt: skip
+        return DeviceCloud(shape(n, 3), shape(n, K, dtype=jnp.int32), shape(n, dtype=bool))
 
-    return jax.jit(lambda *a: solve_pair(*a, refine=True)), (params, cloud(N), cloud(M))
+    return jax.jit(lambda *a: solve_pair(*a, refine=find(True))), (params, cloud(N), cloud(M))
 
 
 PROGRAMS = {

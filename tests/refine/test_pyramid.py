@@ -6,8 +6,9 @@ import solids
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cfr_jax.alignment import pyramid
-from cfr_jax.io import PointCloud
+from cfr_jax.refine import pyramid
+from cfr_jax.refine.generalized_icp import CUT
+from cfr_jax.refine.surfaces import HostSurface
 
 TRUTH = solids.motion(20, (1.0, 2.0, 3.0), (0.1, -0.05, 0.2))
 
@@ -18,7 +19,7 @@ def cloud(count, seed, *, moved=False, normals=False, noise=0.002):
     if moved:  # the source: the truth maps it back
         inverse = np.linalg.inv(TRUTH)
         points, given = solids.move(inverse, points), given @ inverse[:3, :3].T
-    return PointCloud(points, given if normals else None)
+    return HostSurface(points, given if normals else None, 100)
 
 
 def off(transform):
@@ -36,7 +37,7 @@ def test_many_points_give_an_exact_answer(normals):
     source = cloud(3000, 0, moved=True, normals=normals)
     target = cloud(3000, 1, normals=normals)
 
-    fine = pyramid.refine(source, target, START, thinned_to=100)
+    fine = pyramid.refine(source, target, START)
 
     degrees, length = off(fine.transform)
     assert degrees < 0.1 and length < 1e-3  # from a degree and a hundredth
@@ -46,10 +47,10 @@ def test_many_points_give_an_exact_answer(normals):
 def test_fitness_and_error_are_those_of_all_points():
     source, target = cloud(3000, 0, moved=True), cloud(2500, 1)
 
-    fine = pyramid.refine(source, target, START, thinned_to=100)
+    fine = pyramid.refine(source, target, START)
 
     distance = cKDTree(target.points).query(solids.move(fine.transform, source.points))[0]
-    near = distance < pyramid.DISTANCE
+    near = distance < CUT
     np.testing.assert_allclose(fine.fitness, near.mean())
     np.testing.assert_allclose(fine.inlier_rmse, np.sqrt((distance[near] ** 2).mean()), rtol=1e-3)
 
@@ -57,9 +58,9 @@ def test_fitness_and_error_are_those_of_all_points():
 def test_part_of_the_points_in_another_place_do_not_pull():
     source, target = cloud(3000, 0, moved=True), cloud(3000, 1)
     kept = target.points[:, 0] < np.quantile(target.points[:, 0], 0.7)
-    target = PointCloud(np.concatenate([target.points[kept], target.points[~kept] + 0.3]))
+    target = HostSurface(np.concatenate([target.points[kept], target.points[~kept] + 0.3]))
 
-    degrees, length = off(pyramid.refine(source, target, START, thinned_to=100).transform)
+    degrees, length = off(pyramid.refine(source, target, START).transform)
 
     assert degrees < 0.2 and length < 3e-3
 
@@ -67,9 +68,9 @@ def test_part_of_the_points_in_another_place_do_not_pull():
 @pytest.mark.parametrize("away", [0.0, 5.0], ids=["the same points twice", "nothing near"])
 def test_what_cannot_be_made_better_is_kept(away):
     target = cloud(1000, 1, noise=0.0)
-    source = PointCloud(solids.move(np.linalg.inv(TRUTH), target.points + [away, 0, 0]))
+    source = HostSurface(solids.move(np.linalg.inv(TRUTH), target.points + [away, 0, 0]), None, 100)
 
-    fine = pyramid.refine(source, target, TRUTH, thinned_to=100)
+    fine = pyramid.refine(source, target, TRUTH)
 
     assert np.isfinite(fine.transform).all()
     np.testing.assert_allclose(fine.transform, TRUTH, atol=1e-5)

@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cfr_jax.refine import generalized_icp
-from cfr_jax.refine.generalized_icp import Stage, Surface
+from cfr_jax.refine.generalized_icp import Stage
+from cfr_jax.refine.surfaces import Surface
 
 SIZE = 512
 REFINE = jax.jit(generalized_icp.refine, static_argnames=("stages",))

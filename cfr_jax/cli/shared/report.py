@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
 from cfr_jax import __version__
-from cfr_jax.alignment.align import Initial, align
+from cfr_jax.alignment.align import align
 from cfr_jax.alignment.answers import Alignment
+from cfr_jax.alignment.planning import Initial
 from cfr_jax.geometry import motions
 from cfr_jax.io import PointCloud
 from cfr_jax.viewer import Scene
@@ -44,7 +45,7 @@ def register(
     target: PointCloud,
     *,
     weights: str | None = None,
-    refine: bool | Literal["small_gicp"] = True,
+    refine: bool | str = True,
     initial: Initial = None,
     max_points: int | None = None,
     all_points: bool = False,

@@ -7,7 +7,8 @@ from jaxtyping import Float
 
 from cfr_jax.evaluation.baselines.start import Start, initial
 from cfr_jax.io import PointCloud
-from cfr_jax.refine.small_gicp import descend
+from cfr_jax.refine import refinement
+from cfr_jax.refine.surfaces import HostSurface
 
 
 def register(
@@ -23,5 +24,7 @@ def register(
 
     The covariance of a point comes from its `neighbors` nearest points; normals are not used.
     """
-    motion = initial(source, target, start)
-    return descend(source.points, target.points, motion, distances, neighbors, iterations).motion
+    surfaces = HostSurface(source.points), HostSurface(target.points)
+    options = {"distances": distances, "neighbors": neighbors, "iterations": iterations}
+    found = refinement("small_gicp")(*surfaces, initial(source, target, start), **options)
+    return np.asarray(found.transform)

@@ -11,7 +11,9 @@ from cfr_jax.data.scans import estimate_normals
 from cfr_jax.evaluation.baselines.start import Start, initial
 from cfr_jax.geometry import motions
 from cfr_jax.io import PointCloud
-from cfr_jax.refine import generalized_icp
+from cfr_jax.refine import DEFAULT, refinement
+from cfr_jax.refine.generalized_icp import CUT
+from cfr_jax.refine.surfaces import Surface
 
 
 def register(
@@ -28,7 +30,7 @@ def register(
     are estimated where they are missing.
     """
     motion = initial(source, target, start)
-    center, scale = target.points.mean(axis=0), cut / generalized_icp.CUT
+    center, scale = target.points.mean(axis=0), cut / CUT
     moved = motions.apply(motion, source.points)
     found = _refine(
         *(jnp.asarray((points - center) / scale, jnp.float32) for points in (moved, target.points)),
@@ -48,10 +50,10 @@ def _refine(
     target_normals: Float[Array, "m 3"],
 ) -> Float[Array, "4 4"]:
     surfaces = (
-        generalized_icp.Surface(points, normals, jnp.ones(len(points), bool))
+        Surface(points, normals, jnp.ones(len(points), bool))
         for points, normals in ((source, source_normals), (target, target_normals))
     )
-    return generalized_icp.refine(*surfaces, jnp.eye(4)).transform
+    return refinement(DEFAULT)(*surfaces, jnp.eye(4)).transform
 
 
 def _normals(cloud: PointCloud, radius: float) -> Float[np.ndarray, "n 3"]:

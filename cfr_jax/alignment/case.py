@@ -1,0 +1,67 @@
+"""A pair on its way from the plan to the answer, and what is known of it by then."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from cfr_jax.alignment import confidence, quality
+from cfr_jax.alignment.planning import Plan
+from cfr_jax.geometry import units
+from cfr_jax.networks.cfr.registration import Registration
+
+
+@struct.dataclass
+class Found:
+    """What comes back from the device; batched after `vmap`."""
+
+    registration: Registration
+    transform: Float[Array, "*batch 4 4"]
+    """Maps the source, as it was handed over, onto the target."""
+    improved: Bool[Array, "*batch"]
+    """Whether `transform` is not the network's last, but one that fits no worse."""
+    converged: Bool[Array, "*batch"]
+    steps: Int[Array, "*batch"]
+    quality: quality.Quality
+    clues: confidence.Clues
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What a search found; motions map source onto target, the best first."""
+
+    unit_motions: Float[np.ndarray, "k 4 4"]
+    """Of the unit clouds of the plan."""
+    motions: Float[np.ndarray, "k 4 4"]
+    """Of the caller's clouds."""
+    fits: Float[np.ndarray, " k"]
+    """`quality.mutual_fit` of each, on the full clouds; never rising."""
+    frames: units.Frames
+    starts: int
+    """How many were tried."""
+    nearby: bool = False
+    """Whether only starts around where the source lay were."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What the steps of `align` hand on to each other: each takes a case and answers a case."""
+
+    params: Mapping[str, Any]
+    plan: Plan
+    found: Found | None = None
+    """The answer so far, of the plan's unit clouds."""
+    searched: Search | None = None
+    """The last search for a better start, if there was one."""
+    seconds: dict[str, float] = field(default_factory=lambda: {"compile": 0.0, "run": 0.0})
+    """What all steps together took; each adds its own."""
+
+    def solved(self) -> Found:
+        """The answer so far, of a case that has one."""
+        assert self.found is not None, "the network comes first"
+        return self.found
