@@ -12,7 +12,7 @@ from jaxtyping import Bool
 from tqdm import tqdm
 
 from cfr_jax.data.pairs import Pair
-from cfr_jax.evaluation import machine
+from cfr_jax.evaluation import machine, metrics
 from cfr_jax.evaluation.datasets import read_pairs
 from cfr_jax.evaluation.drawing.tables import Numbers, write_table
 from cfr_jax.evaluation.measuring import Measured, measure, only, summarize
@@ -125,13 +125,23 @@ def _of_pairs(
                 "overlap": _number(pair.overlap),
                 "nearly_symmetric": None if symmetric is None else bool(symmetric[index]),
                 "failure": record.failure,
-                "err_r": [_number(value) for value in m.err_r[index]],
-                "err_t": [_number(value) for value in m.err_t[index]],
-                "chamfer": None if m.chamfer is None else _number(m.chamfer[index]),
+                **_errors_of(m, index),
                 "seconds": record.seconds,
                 "transforms": record.transforms,
             }
         )
+    return told
+
+
+def _errors_of(m: Measured, index: int) -> dict[str, Any]:
+    """Of one pair by every metric of the table's columns: of each iteration, or of the answer."""
+    told: dict[str, Any] = {}
+    for metric in metrics.table():
+        if not any(summary.title for summary in metric.summaries):
+            continue
+        errors = m.errors.get(metric.name)
+        numbers = [None] if errors is None else [_number(value) for value in errors[index]]
+        told[metric.name] = numbers if metric.each_iteration else numbers[-1]
     return told
 
 

@@ -3,42 +3,50 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation import metrics
-from cfr_jax.evaluation.metrics import Statistic
 from cfr_jax.evaluation.store import Records
 from cfr_jax.geometry.motions import nearest_motion
 
-# Root mean square and mean absolute differences of Euler angles and of coordinates.
-_BY_AXIS = ("r_mae", "r_rmse", "t_mae", "t_rmse")
+
+class Statistic(NamedTuple):
+    """A number over a set of pairs, and its 95 % interval over such sets."""
+
+    value: float
+    low: float
+    high: float
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Errors of one method over P pairs: degrees, and the unit of the clouds. NaN where it failed.
-
-    `chamfer` is None where the pairs know no whole shapes.
-    """
+    """Errors of one method over P pairs, in degrees or the unit of the clouds; NaN if it failed."""
 
     name: str
-    err_r: Float[np.ndarray, "p i"]
-    """After each iteration the method tells of; the last column is the answer."""
-    err_t: Float[np.ndarray, "p i"]
-    chamfer: Float[np.ndarray, " p"] | None
-    by_axis: dict[str, Float[np.ndarray, " p"]]
-    """`r_mae`, `r_rmse`, `t_mae` and `t_rmse` of the answer, over the axes of each pair."""
+    errors: dict[str, Float[np.ndarray, "p _i"]]
+    """By the name of the metric; after each iteration the method tells of, or of the answer alone.
+    The last column is the answer. A metric that some pairs cannot be measured by is not there."""
     seconds: Float[np.ndarray, " p"]
     failures: dict[int, str]
     about: dict[str, Any]
     started: dict[str, Any] | None
     modules: dict[str, float] | None = None
+
+    @property
+    def err_r(self) -> Float[np.ndarray, "p i"]:
+        """Rotation errors after each iteration."""
+        return self.errors["err_r"]
+
+    @property
+    def err_t(self) -> Float[np.ndarray, "p i"]:
+        """Translation errors after each iteration."""
+        return self.errors["err_t"]
 
     @property
     def answered(self) -> Bool[np.ndarray, " p"]:
@@ -67,28 +75,22 @@ def measure(name: str, records: Records, pairs: Sequence[Pair]) -> Measured:
         if record.transforms is not None
     }
     iterations = max((len(answer) for answer in answers.values()), default=1)
-    err_r, err_t = np.full((2, len(pairs), iterations), np.nan)
-    chamfer, seconds = np.full((2, len(pairs)), np.nan)
-    by_axis = {name: np.full(len(pairs), np.nan) for name in _BY_AXIS}
-    for index, estimates in answers.items():
-        pair, told = pairs[index], records.by_pair[index].seconds
-        truths = np.broadcast_to(pair.transform, estimates.shape)
-        err_r[index] = metrics.err_r(estimates, truths)
-        err_t[index] = metrics.err_t(estimates, truths)
-        seconds[index] = np.nan if told is None else told
-        for measure_of, errors in by_axis.items():
-            errors[index] = getattr(metrics, measure_of)(estimates[-1:], truths[-1:])[0]
-        if pair.clean_source is not None and pair.clean_target is not None:
-            chamfer[index] = metrics.chamfer(
-                estimates[-1], pair.source, pair.target, pair.clean_source, pair.clean_target
-            )
     whole = all(pair.clean_source is not None and pair.clean_target is not None for pair in pairs)
+    errors = {
+        metric.name: np.full((len(pairs), iterations if metric.each_iteration else 1), np.nan)
+        for metric in metrics.table()
+        if whole or not metric.whole_shapes
+    }
+    seconds = np.full(len(pairs), np.nan)
+    for index, estimates in answers.items():
+        told = records.by_pair[index].seconds
+        seconds[index] = np.nan if told is None else told
+        for metric_name, each in errors.items():
+            of = metrics.metric(metric_name)
+            each[index] = of.of(estimates if of.each_iteration else estimates[-1:], pairs[index])
     return Measured(
         name=name,
-        err_r=err_r,
-        err_t=err_t,
-        chamfer=chamfer if whole else None,
-        by_axis=by_axis,
+        errors=errors,
         seconds=seconds,
         failures={k: r.failure for k, r in records.by_pair.items() if r.failure is not None},
         about=records.made_with,
@@ -102,10 +104,7 @@ def only(measured: Measured, rows: Int[np.ndarray, " k"]) -> Measured:
     places = {int(row): place for place, row in enumerate(rows)}
     return dataclasses.replace(
         measured,
-        err_r=measured.err_r[rows],
-        err_t=measured.err_t[rows],
-        chamfer=None if measured.chamfer is None else measured.chamfer[rows],
-        by_axis={name: errors[rows] for name, errors in measured.by_axis.items()},
+        errors={name: errors[rows] for name, errors in measured.errors.items()},
         seconds=measured.seconds[rows],
         failures={places[k]: why for k, why in measured.failures.items() if k in places},
     )
@@ -114,33 +113,41 @@ def only(measured: Measured, rows: Int[np.ndarray, " k"]) -> Measured:
 def summarize(
     measured: Measured, thresholds: Sequence[tuple[float, float]], seed: int
 ) -> dict[str, Statistic | None]:
-    """Mean and median errors over the pairs answered, errors by axis, and recalls over all pairs.
+    """All summaries of the metrics over the pairs answered, and recalls over all pairs.
 
     Each with its bootstrap interval; None where nothing was answered or is not measured.
     """
     answered = measured.answered
-    errors = {
-        "err_r": measured.err_r[answered, -1],
-        "err_t": measured.err_t[answered, -1],
-        "chamfer": None if measured.chamfer is None else measured.chamfer[answered],
-    }
     numbers: dict[str, Statistic | None] = {}
-    for name, values in errors.items():
-        for kind, statistic in (("mean", np.mean), ("median", np.median)):
-            known = values is not None and len(values)
-            numbers[f"{name}_{kind}"] = (
-                metrics.bootstrap(values, statistic, seed=seed) if known else None
+    for metric in metrics.table():
+        errors = measured.errors.get(metric.name)
+        values = np.zeros(0) if errors is None else errors[answered, -1]
+        for summary in metric.summaries:
+            numbers[summary.name] = (
+                bootstrap(values, summary.statistic, seed=seed) if len(values) else None
             )
-    for name, each in measured.by_axis.items():
-        statistic = metrics.root_mean_square if name.endswith("rmse") else np.mean
-        values = each[answered]
-        numbers[name] = metrics.bootstrap(values, statistic, seed=seed) if len(values) else None
     for angle, distance in thresholds:
         hits = measured.recalled(angle, distance).astype(float)
-        numbers[recall_name(angle, distance)] = metrics.bootstrap(hits, seed=seed)
+        numbers[metrics.recall(angle, distance).name] = bootstrap(hits, seed=seed)
     return numbers
 
 
-def recall_name(angle: float, distance: float) -> str:
-    """Recall within (5, 0.1) is called `recall_5deg_0.1`."""
-    return f"recall_{angle:g}deg_{distance:g}"
+def bootstrap(
+    values: Float[np.ndarray, " p"],
+    statistic: Callable[..., np.ndarray | np.floating] = np.mean,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Statistic:
+    """A statistic with its 95 % percentile interval (Efron, 1979) over drawing the pairs anew.
+
+    `statistic` takes an array and an `axis`. The same seed draws the same pairs, so the intervals
+    of two methods on one set of pairs are comparable.
+    """
+    values = np.asarray(values, np.float64)
+    if not np.isfinite(values).all():
+        raise ValueError("values holds numbers that are not finite")
+    if values.ndim != 1 or not len(values):
+        raise ValueError(f"values has shape {values.shape}, wanted (P,) with at least one pair")
+    draws = np.random.default_rng(seed).integers(len(values), size=(resamples, len(values)))
+    low, high = np.percentile(statistic(values[draws], axis=-1), [2.5, 97.5])
+    return Statistic(float(statistic(values, axis=-1)), float(low), float(high))

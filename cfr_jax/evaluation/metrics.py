@@ -1,4 +1,5 @@
-"""How far an estimated motion is from the truth, and what a set of such errors says.
+"""How far an estimated motion is from the truth, what a set of such errors says, and the table of
+these metrics, which everything that measures or shows looks up. A new metric is one entry there.
 
 Everything is float64 numpy on the host, over P pairs at a time. Motions are (4, 4), map source onto
 target, and are rigid; lengths are in the unit of the clouds, angles in degrees.
@@ -10,25 +11,18 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from cfr_jax.data.pairs import Pair
 from cfr_jax.geometry import motions
 
 Motions = Float[np.ndarray, "_pairs 4 4"]
 Errors = Float[np.ndarray, " _pairs"]
-
-
-class Statistic(NamedTuple):
-    """A number over a set of pairs, and its 95 % interval over such sets."""
-
-    value: float
-    low: float
-    high: float
 
 
 def err_r(estimates: Motions, truths: Motions) -> Errors:
@@ -103,25 +97,6 @@ def recalled(
     return (np.asarray(angles) < angle) & (np.asarray(distances) < distance)
 
 
-def bootstrap(
-    values: Errors,
-    statistic: Callable[..., np.ndarray | np.floating] = np.mean,
-    resamples: int = 2000,
-    seed: int = 0,
-) -> Statistic:
-    """A statistic with its 95 % percentile interval (Efron, 1979) over drawing the pairs anew.
-
-    `statistic` takes an array and an `axis`. The same seed draws the same pairs, so the intervals
-    of two methods on one set of pairs are comparable.
-    """
-    values = _finite("values", values)
-    if values.ndim != 1 or not len(values):
-        raise ValueError(f"values has shape {values.shape}, wanted (P,) with at least one pair")
-    draws = np.random.default_rng(seed).integers(len(values), size=(resamples, len(values)))
-    low, high = np.percentile(statistic(values[draws], axis=-1), [2.5, 97.5])
-    return Statistic(float(statistic(values, axis=-1)), float(low), float(high))
-
-
 def root_mean_square(values: np.ndarray, axis: int) -> np.ndarray | np.floating:
     """A statistic for `bootstrap`: the root over all axes of all pairs, not a mean of roots."""
     return np.sqrt(np.square(values).mean(axis=axis))
@@ -154,3 +129,121 @@ def _finite(name: str, values: np.ndarray) -> np.ndarray:
     if not np.isfinite(values).all():
         raise ValueError(f"{name} holds numbers that are not finite")
     return values
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A number that sums errors up over pairs."""
+
+    name: str
+    """As in results.json and on the cards of weights."""
+    statistic: Callable[..., np.ndarray | np.floating]
+    """Takes an array and an `axis`."""
+    title: str | None = None
+    """Of its column in the table; without one it stands in results.json alone."""
+    scale: float = 1.0
+    form: str = ".3f"
+    """How the table writes it, times `scale`."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One way to say how good the estimates of a pair are."""
+
+    name: str
+    of: Callable[[Motions, Pair], Errors]
+    """Errors of several estimates (i, 4, 4) of one pair."""
+    label: str
+    """What it is, for plots."""
+    unit: str | None
+    """None for the unit of the clouds."""
+    summaries: tuple[Summary, ...]
+    lower_is_better: bool = True
+    each_iteration: bool = False
+    """Whether it is told after every iteration, and not only of the answer."""
+    whole_shapes: bool = False
+    """Whether pairs have to know the whole shapes that their clouds are parts of."""
+
+    def axis_label(self, unit: str) -> str:
+        """What a plot writes at its axis, where the clouds are in `unit`."""
+        return f"{self.label} ({self.unit or unit})"
+
+
+def _to_truth(function: Callable[[Motions, Motions], Errors]) -> Callable[[Motions, Pair], Errors]:
+    def of(estimates: Motions, pair: Pair) -> Errors:
+        return function(estimates, np.broadcast_to(pair.transform, estimates.shape))
+
+    return of
+
+
+def _chamfer_of(estimates: Motions, pair: Pair) -> Errors:
+    clouds = pair.source, pair.target, pair.clean_source, pair.clean_target
+    return np.array([chamfer(estimate, *clouds) for estimate in estimates])
+
+
+def _mean_and_median(name: str, title: str, form: str, scale: float = 1.0) -> tuple[Summary, ...]:
+    end = f" ×{scale:g}" if scale != 1 else ""
+    return tuple(
+        Summary(f"{name}_{kind}", statistic, f"{title} {kind}{end}", scale, form)
+        for kind, statistic in (("mean", np.mean), ("median", np.median))
+    )
+
+
+def _each_iteration(
+    function: Callable[[Motions, Motions], Errors],
+    label: str,
+    unit: str | None,
+    summaries: tuple[Summary, ...],
+) -> Metric:
+    name = function.__name__
+    return Metric(name, _to_truth(function), label, unit, summaries, each_iteration=True)
+
+
+def _by_axis(
+    function: Callable[[Motions, Motions], Errors], label: str, unit: str | None
+) -> Metric:
+    name = function.__name__
+    statistic = root_mean_square if name.endswith("rmse") else np.mean
+    return Metric(name, _to_truth(function), label, unit, (Summary(name, statistic),))
+
+
+_CHAMFER = _mean_and_median("chamfer", "CD", ".3f", 1e3)
+_ALL = (
+    _each_iteration(err_r, "rotation error", "degrees", _mean_and_median("err_r", "RE", ".2f")),
+    _each_iteration(err_t, "translation error", None, _mean_and_median("err_t", "TE", ".4f")),
+    Metric("chamfer", _chamfer_of, "Chamfer distance", "squared", _CHAMFER, whole_shapes=True),
+    _by_axis(r_mae, "mean error of the Euler angles", "degrees"),
+    _by_axis(r_rmse, "root mean square error of the Euler angles", "degrees"),
+    _by_axis(t_mae, "mean error of the coordinates", None),
+    _by_axis(t_rmse, "root mean square error of the coordinates", None),
+)
+_TABLE = {metric.name: metric for metric in _ALL}
+
+
+def table() -> tuple[Metric, ...]:
+    """All metrics, in the order of the columns."""
+    return tuple(_TABLE.values())
+
+
+def metric(name: str) -> Metric:
+    """The metric of that name; KeyError where there is none."""
+    return _TABLE[name]
+
+
+def add(new: Metric) -> None:
+    """Puts a metric into the table. Raises ValueError where its name is taken."""
+    if new.name in _TABLE:
+        raise ValueError(f"name: got {new.name!r}, wanted one that is not taken")
+    _TABLE[new.name] = new
+
+
+def recall(angle: float, distance: float, unit: str = "") -> Summary:
+    """The share of pairs that are `recalled`; within (5, 0.1) it is called `recall_5deg_0.1`."""
+    title = f"recall {angle:g}°, {distance:g}{' ' + unit if unit else ''}"
+    return Summary(f"recall_{angle:g}deg_{distance:g}", np.mean, title)
+
+
+def lower_is_better(name: str) -> bool:
+    """Whether that is so of the summary of this name. More than recalls there is none to raise."""
+    of = (m.lower_is_better for m in _TABLE.values() for s in m.summaries if s.name == name)
+    return next(of, False)

@@ -78,19 +78,17 @@ def missed(measured: Scores, expected: Scores, tolerance: dict[str, float]) -> l
     worse = []
     for stage, scores in expected.items():
         for name, value in scores.items():
-            sign = 1.0 if name.startswith("err") else -1.0
+            sign = 1.0 if metrics.lower_is_better(name) else -1.0
             if not sign * (measured[stage][name] - value) <= tolerance[name]:
                 worse.append(f"{stage} {name}: {measured[stage][name]:.3g}, published {value:.3g}")
     return worse
 
 
 def _scores(err_r: np.ndarray, err_t: np.ndarray) -> dict[str, float]:
-    def recall(angle: float, distance: float) -> float:
-        return float(metrics.recalled(err_r, err_t, angle, distance).mean())
-
-    return {
-        "err_r_mean": float(err_r.mean()),
-        "err_r_median": float(np.median(err_r)),
-        "recall_1deg_0.02": recall(1.0, 0.02),
-        "recall_5deg_0.1": recall(5.0, 0.1),
-    }
+    rotations = metrics.metric("err_r").summaries
+    scores = {summary.name: float(summary.statistic(err_r, axis=-1)) for summary in rotations}
+    for threshold in ((1.0, 0.02), (5.0, 0.1)):
+        summary = metrics.recall(*threshold)
+        hits = metrics.recalled(err_r, err_t, *threshold)
+        scores[summary.name] = float(summary.statistic(hits, axis=-1))
+    return scores

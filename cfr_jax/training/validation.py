@@ -10,6 +10,8 @@ from cfr_jax.evaluation import metrics
 from cfr_jax.training import devices, step, stopping
 from cfr_jax.training.learner import Learner
 
+_RECALL = 5.0, 0.1  # degrees, and radii
+
 
 def place(batch: dict, mesh: Mesh) -> dict:
     """The pairs of `sources.fixed_pairs` over the devices, the last one repeated to fill them."""
@@ -36,11 +38,12 @@ def validate(chosen: Learner, params: dict, placed: dict, truth: np.ndarray, mes
         )
     rotation = metrics.err_r(transforms[:, -1], truth)
     translation = metrics.err_t(transforms[:, -1], truth)
+    recall = metrics.recall(*_RECALL)
     return {
         "rotation_mean": float(rotation.mean()),
         "rotation_median": float(np.median(rotation)),
         "translation_mean": float(translation.mean()),
-        "recall_5deg_0.1": float(metrics.recalled(rotation, translation, 5.0, 0.1).mean()),
+        recall.name: float(recall.statistic(metrics.recalled(rotation, translation, *_RECALL))),
         "rotation_by_iteration": [
             float(metrics.err_r(transforms[:, i], truth).mean()) for i in range(transforms.shape[1])
         ],

@@ -165,10 +165,10 @@ def test_identity_and_truth_have_the_errors_that_they_must():
     # then
     np.testing.assert_allclose(identity.err_r[:, -1], [10, 20, 60], atol=1e-6)
     np.testing.assert_allclose(identity.err_t[:, -1], 0.5)
-    assert (identity.chamfer > 0.01).all()
+    assert (identity.errors["chamfer"] > 0.01).all()
     assert (truth.err_r < 1e-5).all()
     assert (truth.err_t < 1e-12).all()
-    assert (truth.chamfer < 1e-12).all()
+    assert (truth.errors["chamfer"] < 1e-12).all()
 
 
 def test_rounding_to_float32_does_not_show_in_the_angle():
@@ -639,4 +639,4 @@ def test_the_errors_without_some_pairs_are_those_of_the_others():
     assert numbers["recall_5deg_0.1"].value == pytest.approx(1 / 3)
     assert numbers["err_r_mean"].value == pytest.approx(15, abs=1e-5)
     assert part.failures == {2: "no luck"}
-    assert len(part.chamfer) == 3
+    assert len(part.errors["chamfer"]) == 3

@@ -4,6 +4,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from cfr_jax.evaluation import metrics
+from cfr_jax.evaluation.measuring import bootstrap
 
 
 def motions(rotations, translations):
@@ -115,7 +116,7 @@ def test_intervals_hold_the_true_mean_about_as_often_as_they_say():
     held = 0
     for trial in range(200):
         values = np.random.default_rng(trial).normal(3.0, 1.0, 60)
-        _, low, high = metrics.bootstrap(values, resamples=300, seed=trial)
+        _, low, high = bootstrap(values, resamples=300, seed=trial)
         held += low <= 3.0 <= high
 
     assert 0.89 <= held / 200 <= 0.99
@@ -124,15 +125,15 @@ def test_intervals_hold_the_true_mean_about_as_often_as_they_say():
 def test_the_same_seed_gives_the_same_interval():
     values = np.random.default_rng(0).exponential(size=40)
 
-    assert metrics.bootstrap(values, seed=1) == metrics.bootstrap(values, seed=1)
-    assert metrics.bootstrap(values, seed=1) != metrics.bootstrap(values, seed=2)
+    assert bootstrap(values, seed=1) == bootstrap(values, seed=1)
+    assert bootstrap(values, seed=1) != bootstrap(values, seed=2)
 
 
 def test_the_root_mean_square_is_over_all_axes_of_all_pairs():
     estimates, truths, *_ = known_errors()
 
     each = metrics.t_rmse(estimates, truths)
-    whole = metrics.bootstrap(each, metrics.root_mean_square)
+    whole = bootstrap(each, metrics.root_mean_square)
 
     squares = (estimates - truths)[:, :3, 3] ** 2
     assert whole.value == pytest.approx(np.sqrt(squares.mean()))
@@ -147,4 +148,4 @@ def test_bad_input_is_named():
     with pytest.raises(ValueError, match=r"\(1, 4, 4\) and truths \(2, 4, 4\)"):
         metrics.err_t(good, np.concatenate([good, good]))
     with pytest.raises(ValueError, match="at least one pair"):
-        metrics.bootstrap(np.zeros(0))
+        bootstrap(np.zeros(0))

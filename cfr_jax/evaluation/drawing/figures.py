@@ -72,13 +72,11 @@ def recall_over_error(
 ) -> None:
     """Share of all pairs whose error is below a bound, over the bound."""
     figure = new_figure(11, 4.2)
-    panels = (
-        (0, np.linspace(0, angle, 200), "rotation error (degrees)"),
-        (1, np.linspace(0, distance, 200), f"translation error ({unit})"),
-    )
-    for axes, (which, bounds, label) in zip(figure.subplots(1, 2), panels, strict=True):
+    panels = ("err_r", angle), ("err_t", distance)
+    for axes, (name, most) in zip(figure.subplots(1, 2), panels, strict=True):
+        bounds, label = np.linspace(0, most, 200), metrics.metric(name).axis_label(unit)
         for style, m in _styled(measured):
-            errors = np.sort(np.nan_to_num((m.err_r, m.err_t)[which][:, -1], nan=np.inf))
+            errors = np.sort(np.nan_to_num(m.errors[name][:, -1], nan=np.inf))
             axes.plot(bounds, np.searchsorted(errors, bounds) / len(errors), **style)
         axes.set(xlabel=label, ylabel="share of pairs", ylim=(0, 1), xlim=(0, bounds[-1]))
     _finish(figure, path)
@@ -112,15 +110,12 @@ def by_iteration(path: Path, measured: Sequence[Measured], unit: str) -> None:
     refinement counts as one more."""
     if all(m.err_r.shape[1] == 1 for m in measured):
         return
-    figure = new_figure(11, 4.2)
-    for axes, which, label in zip(
-        figure.subplots(1, 2),
-        ("err_r", "err_t"),
-        ("rotation error (degrees)", f"translation error ({unit})"),
-        strict=True,
-    ):
+    shown = [metric for metric in metrics.table() if metric.each_iteration]
+    figure = new_figure(1.0 + 5 * len(shown), 4.2)
+    for axes, metric in zip(figure.subplots(1, len(shown)), shown, strict=True):
+        label = metric.axis_label(unit)
         for style, m in _styled(measured):
-            errors = getattr(m, which)[m.answered]
+            errors = m.errors[metric.name][m.answered]
             if errors.shape[1] == 1:
                 continue
             steps = np.arange(1, errors.shape[1] + 1)

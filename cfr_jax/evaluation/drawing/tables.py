@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from cfr_jax.evaluation.measuring import Measured, recall_name
-from cfr_jax.evaluation.metrics import Statistic
+from cfr_jax.evaluation import metrics
+from cfr_jax.evaluation.measuring import Measured, Statistic
+from cfr_jax.evaluation.metrics import Summary
 
 Numbers = Mapping[str, Statistic | None]
 _NONE = "–"
@@ -31,7 +32,7 @@ def write_table(
     """
     unit = about["unit"]
     lengths = unit or "the unit of the clouds"
-    columns = _columns(about["thresholds"], unit, any(m.chamfer is not None for m in measured))
+    columns = _columns(measured, about["thresholds"], unit)
     lines = [
         f"# {about['title']}",
         "",
@@ -71,13 +72,13 @@ def write_table(
 def _errors(
     measured: Sequence[Measured],
     numbers: Mapping[str, Numbers],
-    columns: Sequence[tuple[str, str, float, str]],
+    columns: Sequence[Summary],
 ) -> list[str]:
     """A row for each method, and once more with the intervals."""
-    header = ["method", *(title for title, *_ in columns)]
+    header = ["method", *(str(column.title) for column in columns)]
     values, intervals = (
         [
-            [m.name, *(tell(numbers[m.name][k], s, form) for _, k, s, form in columns)]
+            [m.name, *(tell(numbers[m.name][c.name], c.scale, c.form) for c in columns)]
             for m in measured
         ]
         for tell in (_value, _interval)
@@ -95,7 +96,7 @@ def _errors(
 def _apart(
     measured: Sequence[Measured],
     numbers: Mapping[str, Numbers],
-    columns: Sequence[tuple[str, str, float, str]],
+    columns: Sequence[Summary],
     about: Mapping[str, Any],
 ) -> list[str]:
     if not measured:
@@ -136,24 +137,12 @@ def _modules(measured: Sequence[Measured]) -> list[str]:
 
 
 def _columns(
-    thresholds: Sequence[tuple[float, float]], unit: str, chamfer: bool
-) -> list[tuple[str, str, float, str]]:
-    """Title, key, scale, format."""
-    columns = [
-        ("RE mean", "err_r_mean", 1.0, ".2f"),
-        ("RE median", "err_r_median", 1.0, ".2f"),
-        ("TE mean", "err_t_mean", 1.0, ".4f"),
-        ("TE median", "err_t_median", 1.0, ".4f"),
-    ]
-    if chamfer:
-        columns += [
-            ("CD mean ×1000", "chamfer_mean", 1e3, ".3f"),
-            ("CD median ×1000", "chamfer_median", 1e3, ".3f"),
-        ]
-    for angle, distance in thresholds:
-        title = f"recall {angle:g}°, {distance:g}{' ' + unit if unit else ''}"
-        columns.append((title, recall_name(angle, distance), 1.0, ".3f"))
-    return columns
+    measured: Sequence[Measured], thresholds: Sequence[Sequence[float]], unit: str
+) -> list[Summary]:
+    """Of every metric that some method was measured by, and the recalls."""
+    known = [metric for metric in metrics.table() if any(metric.name in m.errors for m in measured)]
+    summaries = [summary for metric in known for summary in metric.summaries if summary.title]
+    return summaries + [metrics.recall(*each, unit) for each in thresholds]
 
 
 def _value(number: Statistic | None, scale: float, form: str) -> str:
