@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int64, Real
+from jaxtyping import Float64, Int64, Real
 
 from cfr_jax.io.cloud import PointCloud, checked_points, usable_normals
 
@@ -43,21 +43,39 @@ class Mesh:
                 f"triangle {triangle} names vertex {self.triangles[triangle, corner]}, "
                 f"wanted 0 to {len(vertices) - 1}"
             )
-        a, b, c = (vertices[self.triangles[:, corner]] for corner in range(3))
-        ab, ac = b - a, c - a
-        cross = np.cross(ab, ac)
-        cumulative = np.cumsum(np.sqrt(np.einsum("ij,ij->i", cross, cross)))
-        if not cumulative[-1] > 0:
-            raise ValueError(f"all {len(cross)} triangles have no area, wanted a surface")
-
         generator = np.random.default_rng(seed)
-        # side="right" never picks a triangle of zero area: its bound equals the one before.
-        draw = generator.uniform(0.0, cumulative[-1], count)
-        chosen = np.searchsorted(cumulative, draw, side="right")
-        u, v = generator.uniform(size=(2, count, 1))
-        folded = u + v > 1.0  # the far half of the parallelogram, turned back into the triangle
-        u, v = np.where(folded, 1.0 - u, u), np.where(folded, 1.0 - v, v)
-        return PointCloud(a[chosen] + u * ab[chosen] + v * ac[chosen], cross[chosen], self.name)
+        points, normals = sample_triangles(vertices[self.triangles], count, generator)
+        return PointCloud(points, normals, self.name)
+
+
+def sample_triangles(
+    corners: Float64[np.ndarray, "t 3 3"], count: int, rng: np.random.Generator
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+    """Points uniform over the area, and the unit normals of the triangles they lie on.
+
+    Raises ValueError where no triangle has an area.
+    """
+    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    areas, normals = areas_and_normals(corners)
+    cumulative = np.cumsum(areas)
+    if not cumulative[-1] > 0:
+        raise ValueError(f"all {len(corners)} triangles have no area, wanted a surface")
+    # side="right" never picks a triangle of zero area: its bound equals the one before
+    draw = rng.uniform(0.0, cumulative[-1], count)
+    chosen = np.searchsorted(cumulative, draw, side="right")
+    # The square root spreads evenly over a triangle what is drawn along its height.
+    along, across = np.sqrt(rng.uniform(size=(count, 1))), rng.uniform(size=(count, 1))
+    points = a[chosen] + along * ((1 - across) * ab[chosen] + across * ac[chosen])
+    return points, normals[chosen]
+
+
+def areas_and_normals(
+    corners: Float64[np.ndarray, "t 3 3"],
+) -> tuple[Float64[np.ndarray, " t"], Float64[np.ndarray, "t 3"]]:
+    """Of each triangle; the unit normal points to where its corners run counter-clockwise."""
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    double = np.linalg.norm(cross, axis=1)
+    return double / 2, cross / np.where(double > 0, double, 1.0)[:, None]
 
 
 def fan_triangles(

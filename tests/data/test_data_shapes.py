@@ -9,9 +9,8 @@ from cfr_jax.data.making.shapes import (
     clean_triangles,
     make_shape,
     name_share,
-    sample_triangles,
 )
-from cfr_jax.io.mesh import Mesh
+from cfr_jax.io.mesh import Mesh, sample_triangles
 
 POINTS = 512
 

@@ -10,10 +10,10 @@ import hashlib
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64
 from scipy.spatial import cKDTree
 
-from cfr_jax.io.mesh import Mesh
+from cfr_jax.io.mesh import Mesh, areas_and_normals, sample_triangles
 
 FLATTEST = 0.05  # least share of the smallest extent in the largest
 DENSEST = 0.2  # least median distance to the mean, of a shape with largest norm 1
@@ -89,34 +89,10 @@ def clean_triangles(mesh: Mesh) -> Float64[np.ndarray, "t 3 3"]:
     extent = np.ptp(corners.reshape(-1, 3), axis=0).max()
     if not 0 < extent < 1e12:
         raise Unfit("no extent, or none that is a number")
-    fit: Bool[np.ndarray, " t"] = _areas(corners / extent)[0] > 1e-14
+    fit: Bool[np.ndarray, " t"] = areas_and_normals(corners / extent)[0] > 1e-14
     if not fit.any():
         raise Unfit("no faces")
     return corners[fit]
-
-
-def sample_triangles(
-    corners: Float64[np.ndarray, "t 3 3"], count: int, rng: np.random.Generator
-) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Points uniform over the area, and the unit normals of the triangles they lie on."""
-    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    areas, normals = _areas(corners)
-    cumulative = np.cumsum(areas)
-    chosen: Int64[np.ndarray, " n"] = np.searchsorted(
-        cumulative, rng.uniform(0.0, cumulative[-1], count), side="right"
-    )
-    # The square root spreads evenly over a triangle what is drawn along its height.
-    along, across = np.sqrt(rng.uniform(size=(count, 1))), rng.uniform(size=(count, 1))
-    points = a[chosen] + along * ((1 - across) * ab[chosen] + across * ac[chosen])
-    return points, normals[chosen]
-
-
-def _areas(
-    corners: Float64[np.ndarray, "t 3 3"],
-) -> tuple[Float64[np.ndarray, " t"], Float64[np.ndarray, "t 3"]]:
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double = np.linalg.norm(cross, axis=1)
-    return double / 2, cross / np.where(double > 0, double, 1.0)[:, None]
 
 
 def _flatness(points: Float64[np.ndarray, "n 3"]) -> float:

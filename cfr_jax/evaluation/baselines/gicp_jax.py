@@ -53,7 +53,7 @@ def _refine(
         Surface(points, normals, jnp.ones(len(points), bool))
         for points, normals in ((source, source_normals), (target, target_normals))
     )
-    return refinement(DEFAULT)(*surfaces, jnp.eye(4)).transform
+    return jnp.asarray(refinement(DEFAULT)(*surfaces, jnp.eye(4)).transform)
 
 
 def _normals(cloud: PointCloud, radius: float) -> Float[np.ndarray, "n 3"]:
