@@ -43,21 +43,21 @@ def main(_) -> None:
 
     from cfr_jax.cli.shared.cache import keep_compiled_programs
     from cfr_jax.training import devices, identity, loop, stopping, validation
+    from cfr_jax.training.config import checked
 
     # orbax writes pages about a full disk; what went wrong is said below, once
     logging.set_verbosity(logging.FATAL)
     warnings.showwarning = _warn
     workdir = Path(_WORKDIR.value)
     try:
+        config = checked(_CONFIG.value)
         if not _COORDINATOR.value:
-            # what a phase lacks is said by `run`
-            batches = (phase.get("batch", 1) for phase in _CONFIG.value.get("phases", ()))
-            cores = devices.of_cores(*batches)
+            cores = devices.of_cores(*(phase.batch for phase in config.phases))
             if cores is not None:
                 jax.config.update("jax_num_cpu_devices", cores)
         keep_compiled_programs()
         devices.join(_COORDINATOR.value, _PROCESSES.value, _PROCESS.value)
-        best = loop.run(_CONFIG.value, workdir)
+        best = loop.run(config, workdir)
     except (ValueError, OSError) as error:
         raise SystemExit(f"train.py: error: {error}") from error
     except stopping.Stopped as stopped:
