@@ -30,7 +30,7 @@ def main(_) -> None:
     config = _CONFIG.value
     for name, flag in (("weights", _WEIGHTS), ("limit", _LIMIT), ("seed", _SEED)):
         if flag.value is not None:
-            config[name] = flag.value
+            setattr(config, name, flag.value)
     command = shlex.join(["python", *sys.argv])
     try:
         print(compare(config, Path(_OUT.value), _METHODS.value, _PLOTS.value, command))
