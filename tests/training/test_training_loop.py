@@ -367,7 +367,7 @@ def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monk
 
     def full_after_step_8(self, number, *rest):
         if number > 8:
-            monkeypatch.setattr("cfr_jax.training.manifest.write", no_space)
+            monkeypatch.setattr("cfr_jax.runtime.manifest.write", no_space)
         finish(self, number, *rest)
 
     def no_space(folder):
