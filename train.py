@@ -1,13 +1,14 @@
 """Trains the network: python train.py --config=configs/open_cad.py --workdir=runs/open_cad
 
-A config is a Python file. Of those in configs/, each with its fields explained:
+A config is a Python file that says what differs from the defaults. Those in configs/:
 
-    open_cad.py    the open CAD corpus, about two hours on two cores; every field stands here
+    open_cad.py    the open CAD corpus, about two hours on two cores: the defaults
     object.py      the same at length: the weights `object`
     scans.py       fine-tuning on real scans: the weights `scan`
     own_scans.py   scans of your own (docs/train-on-your-data.md)
 
-Any field can be set on the command line, one of a list by its place:
+Every field, with its default and its meaning, is in cfr_jax/training/config.py. Any of them can be
+set on the command line, one of a list by its place:
 
     python train.py --config=configs/open_cad.py --workdir=runs/mine \\
         --config.data.train=corpus/train.h5 --config.data.validation=corpus/val.h5 \\
