@@ -87,7 +87,7 @@ def methods_of(config: EvaluationConfig, names: Sequence[str], seed: int) -> lis
 
 def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
     entry = config.methods[name]
-    use, options = entry.use, dict(entry.options)
+    use, options = entry.use, dict(sorted(entry.options.items()))
     estimated, batch = entry.estimated_normals, entry.batch
     threads = config.threads if entry.threads is None else entry.threads
     about: dict[str, Any] = {

@@ -95,7 +95,7 @@ def _changes(before: dict, now: dict) -> Iterator[str]:
 
 
 def _flat(tree: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(tree, dict) and tree:
+    if isinstance(tree, dict):  # an empty one says nothing
         for key, value in tree.items():
             yield from _flat(value, f"{name}.{key}" if name else key)
     elif isinstance(tree, list) and any(isinstance(value, dict) for value in tree):

@@ -1,5 +1,6 @@
 """A whole training: it resumes bit for bit, leaves what it measured, and says why it stops."""
 
+import copy
 import json
 import os
 import signal
@@ -11,7 +12,16 @@ import training_samples as samples
 from training_samples import assert_same, config
 
 from cfr_jax.data.augment import Sampling
-from cfr_jax.training import devices, learner, loop, optimizers, step, stopping, validation
+from cfr_jax.training import (
+    devices,
+    identity,
+    learner,
+    loop,
+    optimizers,
+    step,
+    stopping,
+    validation,
+)
 from cfr_jax.training.checkpoints import Checkpoints, SaveError
 from cfr_jax.training.config import Phase
 from cfr_jax.training.reporting.board import Board
@@ -186,6 +196,18 @@ def test_another_config_goes_on_with_a_word(killed_config, tmp_path, capsys):
     told = capsys.readouterr().out
     assert "going on from step 4" in told and "keep_checkpoints 2 → 3" in told
     assert int(state_of(tmp_path).step) == 16
+
+
+def test_a_run_from_before_phases_had_samplings_goes_on_without_a_word(corpus_file, tmp_path):
+    stamps = {"data.train": "a", "data.validation": "b"}
+    now = identity.begin(config(corpus_file), stamps)
+    before = copy.deepcopy(now) | {"step": 4}
+    for phase in before["config"]["phases"]:
+        assert phase.pop("sampling") == {}
+
+    told = identity.go_on(before, now, 16, tmp_path)
+
+    assert told == ["going on from step 4"] and now["step"] == 4
 
 
 def test_a_workdir_of_other_training_data_is_refused(tmp_path, whole):
