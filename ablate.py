@@ -26,17 +26,17 @@ def main(_) -> None:
     name = _ABLATION.value
     if name not in known["ABLATIONS"]:
         raise SystemExit(f"ablate.py: error: no ablation {name!r}: {', '.join(known['ABLATIONS'])}")
-    steps = "" if _STEPS.value is None else f",{_STEPS.value}"
-    config = known["get_config"](name + steps)
-    for variant in config.trainings:
+    steps = "" if _STEPS.value is None else str(_STEPS.value)
+    chosen = f",{steps}" if steps else ""
+    for variant in known["trainings"](name):
         _run(
             "train.py",
-            f"--config={_HERE / 'configs' / 'ablations.py'}:{variant}{steps}",
-            f"--workdir={config.runs}/{variant}",
+            f"--config={_HERE / 'configs' / 'ablations.py'}:{variant}{chosen}",
+            f"--workdir={known['workdir'](variant, steps)}",
         )
     _run(
         "evaluate.py",
-        f"--config={_EVALUATION}:{name}{steps}",
+        f"--config={_EVALUATION}:{name}{chosen}",
         f"--limit={_LIMIT.value}",
         f"--out={_OUT.value or f'results/ablations/{name}'}",
     )

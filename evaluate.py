@@ -1,7 +1,8 @@
 """Compares methods: python evaluate.py --config=configs/eval_open_cad.py --out=results/open_cad
 
-Any field of the config can be set on the command line, as in --config.data.protocol=clean. Run the
-same command again and it goes on where it stopped; methods added later join those already run.
+Any field of the config can be set on the command line, as in --config.data.protocol=clean; all are
+in cfr_jax/evaluation/config.py. Run the same command again and it goes on where it stopped; methods
+added later join those already run.
 """
 
 import shlex
@@ -30,7 +31,7 @@ def main(_) -> None:
     config = _CONFIG.value
     for name, flag in (("weights", _WEIGHTS), ("limit", _LIMIT), ("seed", _SEED)):
         if flag.value is not None:
-            config[name] = flag.value
+            setattr(config, name, flag.value)
     command = shlex.join(["python", *sys.argv])
     try:
         print(compare(config, Path(_OUT.value), _METHODS.value, _PLOTS.value, command))

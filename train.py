@@ -1,13 +1,14 @@
 """Trains the network: python train.py --config=configs/open_cad.py --workdir=runs/open_cad
 
-A config is a Python file. Of those in configs/, each with its fields explained:
+A config is a Python file that says what differs from the defaults. Those in configs/:
 
-    open_cad.py    the open CAD corpus, about two hours on two cores; every field stands here
+    open_cad.py    the open CAD corpus, about two hours on two cores: the defaults
     object.py      the same at length: the weights `object`
     scans.py       fine-tuning on real scans: the weights `scan`
     own_scans.py   scans of your own (docs/train-on-your-data.md)
 
-Any field can be set on the command line, one of a list by its place:
+Every field, with its default and its meaning, is in cfr_jax/training/config.py. Any of them can be
+set on the command line, one of a list by its place:
 
     python train.py --config=configs/open_cad.py --workdir=runs/mine \\
         --config.data.train=corpus/train.h5 --config.data.validation=corpus/val.h5 \\
@@ -43,21 +44,21 @@ def main(_) -> None:
 
     from cfr_jax.cli.shared.cache import keep_compiled_programs
     from cfr_jax.training import devices, identity, loop, stopping, validation
+    from cfr_jax.training.config import checked
 
     # orbax writes pages about a full disk; what went wrong is said below, once
     logging.set_verbosity(logging.FATAL)
     warnings.showwarning = _warn
     workdir = Path(_WORKDIR.value)
     try:
+        config = checked(_CONFIG.value)
         if not _COORDINATOR.value:
-            # what a phase lacks is said by `run`
-            batches = (phase.get("batch", 1) for phase in _CONFIG.value.get("phases", ()))
-            cores = devices.of_cores(*batches)
+            cores = devices.of_cores(*(phase.batch for phase in config.phases))
             if cores is not None:
                 jax.config.update("jax_num_cpu_devices", cores)
         keep_compiled_programs()
         devices.join(_COORDINATOR.value, _PROCESSES.value, _PROCESS.value)
-        best = loop.run(_CONFIG.value, workdir)
+        best = loop.run(config, workdir)
     except (ValueError, OSError) as error:
         raise SystemExit(f"train.py: error: {error}") from error
     except stopping.Stopped as stopped:

@@ -1,7 +1,7 @@
 """Fits the confidences of `register` and of `align` to validation pairs, or measures them.
 
-    python -m benchmarks.fit_confidence --corpus ../shared/data/open_cad/val.h5 --pairs 500 --fit
-    python -m benchmarks.fit_confidence --corpus ../shared/data/open_cad/test.h5 --pairs 300 \\
+    python -m benchmarks.fit_confidence --corpus data/open_cad/val.h5 --pairs 500 --fit
+    python -m benchmarks.fit_confidence --corpus data/open_cad/test.h5 --pairs 300 \\
         --figure docs/images/confidence.png
 
 Of ten pairs three are of the partial protocol with exact normals and two with estimated ones, three

@@ -1,6 +1,6 @@
 """How near the refinement comes to what it reaches when it starts at the truth.
 
-    python -m benchmarks.refinement --corpus ../shared/data/open_cad/val.h5 --pairs 60
+    python -m benchmarks.refinement --corpus data/open_cad/val.h5 --pairs 60
 
 Pairs of the partial protocol with exact normals. `refine` starts at the network's answer, and its
 descent at the truth, which it leaves (`refine` would keep a start that scores better); told are the

@@ -3,13 +3,13 @@
 Of trainings of another length it is --config=configs/eval_ablations.py:weights,3000.
 
 As `eval_open_cad.py`, with the variants of one ablation as methods. Where a variant needs weights
-of its own, they are those that `ablate.py` trains in `config.runs`, by `ablations.py`.
+of its own, they are those that `ablate.py` trains by `ablations.py`.
 """
 
 import runpy
 from pathlib import Path
 
-from ml_collections import ConfigDict
+from cfr_jax.evaluation.config import EvaluationConfig, MethodEntry
 
 # By ablation: its methods, what each does otherwise, and which training of `ablations.py` it needs.
 ABLATIONS = {
@@ -33,27 +33,36 @@ ABLATIONS = {
 }
 
 
-def get_config(chosen: str = "weights") -> ConfigDict:
-    """Everything that `evaluate.py` reads, and `trainings`, which `ablate.py` reads."""
+def get_config(chosen: str = "weights") -> EvaluationConfig:
+    """An ablation, and perhaps how many steps its trainings took."""
     # a config is a file and no module: it is found beside this one
     beside = Path(__file__).with_name("eval_open_cad.py")
     config = runpy.run_path(str(beside))["get_config"]()
     ablation, _, steps = chosen.partition(",")
-    variants = ABLATIONS[ablation]
-    # where the weights of the trainings are
-    config.runs = f"runs/ablations_{steps}" if steps else "runs/ablations"
-    config.trainings = tuple(dict.fromkeys(run for run, _ in variants.values() if run))
     config.title = f"Ablation: {ablation}"
-    if config.trainings:
+    if trainings(ablation):
         short = Path(__file__).with_name("ablations.py")
-        steps = steps or runpy.run_path(str(short))["STEPS"]
-        config.title += f" (after short trainings of {int(steps):,} steps)"
-    config.methods = ConfigDict()
-    for name, (run, settings) in variants.items():
-        entry = {"use": "cfr", "batch": 8, "modules": True}
-        entry["options"] = {"refine": False, "settings": settings}
-        entry["estimated_normals"] = name.startswith("estimated")
-        if run:
-            entry["weights"] = f"{config.runs}/{run}/weights.safetensors"
-        config.methods[name] = entry
+        taken = int(steps or runpy.run_path(str(short))["STEPS"])
+        config.title += f" (after short trainings of {taken:,} steps)"
+    config.methods = {
+        name: MethodEntry(
+            "cfr",
+            {"refine": False, "settings": settings},
+            weights=f"{workdir(run, steps)}/weights.safetensors" if run else "",
+            batch=8,
+            estimated_normals=name.startswith("estimated"),
+            modules=True,
+        )
+        for name, (run, settings) in ABLATIONS[ablation].items()
+    }
     return config
+
+
+def trainings(ablation: str) -> tuple[str, ...]:
+    """The variants of `ablations.py` that an ablation compares."""
+    return tuple(dict.fromkeys(run for run, _ in ABLATIONS[ablation].values() if run))
+
+
+def workdir(variant: str, steps: str = "") -> str:
+    """Where a variant is trained; by another number of steps, in another folder."""
+    return f"runs/ablations_{steps}/{variant}" if steps else f"runs/ablations/{variant}"

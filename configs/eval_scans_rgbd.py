@@ -1,66 +1,48 @@
 """Evaluation on pairs of depth images: an HDF5 file or a CSV list (`cfr_jax.data.pairs`)."""
 
-from ml_collections import ConfigDict
+from cfr_jax.evaluation.config import EvaluationConfig, MethodEntry
 
 
-def get_config() -> ConfigDict:
-    """Everything that `evaluate.py` reads. Lengths in meters."""
-    config = ConfigDict()
-    config.title = "Depth images of a room"
-    config.data = ConfigDict()
-    config.data.kind = "pairs"
-    config.data.path = "../shared/data/scans/rgbd/pairs.h5"  # or a list: source,target,16 numbers
-    config.data.frames = ()  # first and stop: pairs of these frames alone, as `scans.test_frames`
-    config.limit = 0
-    config.seed = 0
-    config.weights = "object"
-    config.rpmnet_weights = "rpmnet"  # by name or path; RPM-Net is left out where there are none
-    config.threads = 2
-    config.timeout = 120.0  # seconds a pair
-    config.unit = "m"
-    config.thresholds = ((1.0, 0.02), (5.0, 0.1), (15.0, 0.3))  # degrees, m
-    config.main_threshold = (5.0, 0.1)
-    config.limits = (15.0, 0.3)
-    config.methods = ConfigDict(methods())
-    return config
+def get_config() -> EvaluationConfig:
+    """Lengths in meters."""
+    return EvaluationConfig(
+        title="Depth images of a room",
+        data={
+            "kind": "pairs",
+            "path": "data/scans/rgbd/pairs.h5",  # or a list: source,target,16 numbers
+            # first and stop: pairs of these frames alone; `scans.py` leaves (400, 500) for a test
+            "frames": (),
+        },
+        methods=methods(),
+        timeout=120.0,
+        unit="m",
+        thresholds=((1.0, 0.02), (5.0, 0.1), (15.0, 0.3)),
+    )
 
 
-def methods() -> dict:
+def methods() -> dict[str, MethodEntry]:
     """For rooms thinned to 2.5 cm; such pairs have no normals, so every method estimates them."""
-    local = {"distances": (0.2, 0.1, 0.05)}
-    features = {"normal_radius": 0.1, "feature_radius": 0.25, "voxel": 0.05}
-    prepared = {"through": "preparation", "max_points": 2000}
+    # frames of one video: where the camera was is a better start than the centroid
+    local = {"distances": (0.2, 0.1, 0.05), "start": "identity"}
+    ours = {"cut": 0.05, "normal_radius": 0.1, "start": "identity"}
+    features = {"normal_radius": 0.1, "feature_radius": 0.25, "voxel": 0.05, "distance": 0.05}
+    # prepared as `align` prepares clouds for our network
+    prepared = {"through": "preparation", "max_points": 2000, "refine": False}
     network = {"through": "align", "max_points": 2000}
     # One thread where threads would race: for random numbers, or for the order of a sum.
     return {
-        "identity": {"use": "identity"},
-        "truth": {"use": "truth"},
-        # frames of one video: where the camera was is a better start than the centroid
-        "icp": {"use": "icp", "options": local | {"start": "identity"}, "threads": 1},
-        "icp_plane": {
-            "use": "icp_plane",
-            "options": local | {"start": "identity", "normal_radius": 0.1},
-            "threads": 1,
-        },
-        "gicp": {"use": "gicp", "options": local | {"start": "identity"}, "threads": 1},
-        "gicp_jax": {
-            "use": "gicp_jax",
-            "options": {"cut": 0.05, "normal_radius": 0.1, "start": "identity"},
-        },
-        "fgr": {"use": "fgr", "options": features | {"distance": 0.05}},
-        "fgr_icp": {
-            "use": "fgr_icp",
-            "options": features | {"distance": 0.05, "distances": (0.1, 0.05)},
-            "threads": 1,
-        },
-        "ransac": {"use": "ransac", "options": features | {"distance": 0.075}, "threads": 1},
-        "kiss_matcher": {"use": "kiss_matcher", "options": {"voxel": 0.05}, "threads": 1},
-        "cfr": {"use": "cfr", "options": network | {"refine": False}},
-        "cfr_align": {"use": "cfr", "options": network | {"refine": True}},
-        # prepared as `align` prepares clouds for our network
-        "rpmnet": {
-            "use": "rpmnet",
-            "options": prepared | {"refine": False, "settings": {"optimized": False}},
-        },
-        "rpmnet_optim": {"use": "rpmnet", "options": prepared | {"refine": False}},
+        "identity": MethodEntry("identity"),
+        "truth": MethodEntry("truth"),
+        "icp": MethodEntry("icp", local, threads=1),
+        "icp_plane": MethodEntry("icp_plane", local | {"normal_radius": 0.1}, threads=1),
+        "gicp": MethodEntry("gicp", local, threads=1),
+        "gicp_jax": MethodEntry("gicp_jax", ours),
+        "fgr": MethodEntry("fgr", features),
+        "fgr_icp": MethodEntry("fgr_icp", features | {"distances": (0.1, 0.05)}, threads=1),
+        "ransac": MethodEntry("ransac", features | {"distance": 0.075}, threads=1),
+        "kiss_matcher": MethodEntry("kiss_matcher", {"voxel": 0.05}, threads=1),
+        "cfr": MethodEntry("cfr", network | {"refine": False}),
+        "cfr_align": MethodEntry("cfr", network | {"refine": True}),
+        "rpmnet": MethodEntry("rpmnet", prepared | {"settings": {"optimized": False}}),
+        "rpmnet_optim": MethodEntry("rpmnet", prepared),
     }

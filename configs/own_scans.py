@@ -3,37 +3,44 @@
 See docs/train-on-your-data.md.
 """
 
-import runpy
-from pathlib import Path
+from typing import Any
 
-from ml_collections import ConfigDict
+from cfr_jax.training.config import (
+    DataSection,
+    Phase,
+    SamplingSection,
+    TrainingConfig,
+    TrainSection,
+)
 
 
-def get_config() -> ConfigDict:
-    """As `scans.py`, with the data that you name: --config.data.train.scans.path=FOLDER and so on.
+def get_config() -> TrainingConfig:
+    """From shipped weights on. Say where scans are: --config.data.train.scans.path=FOLDER."""
+    return TrainingConfig(
+        data=DataSection(train=sources(), validation=sources()),
+        phases=(Phase(steps=2000, points=1024, neighbors=32, batch=8),),
+        sampling=SamplingSection(
+            keep=(0.5, 0.9),
+            translation=0.15,  # each cloud lies about its own centroid
+            both_ways=1.0,
+            any_orientation=0.5,
+            scale=(0.85, 1.15),
+            noise=(0.0, 0.01),
+            outliers=(0.0, 0.03),
+            uneven=0.2,
+            estimated_normals=0.7,  # of those that have normals; the rest always
+        ),
+        train=TrainSection(peak_rate=3e-4, start_from="object"),
+        validate_every=250,
+        validation_pairs=100,
+    )
 
-    A source is left out where its `repeat` is 0.
-    """
-    # a config is a file and no module: it is found beside this one
-    beside = Path(__file__).with_name("scans.py")
-    config = runpy.run_path(str(beside))["get_config"]()
-    config.data = ConfigDict()
-    config.data.train = {
+
+def sources() -> dict[str, dict[str, Any]]:
+    """What there may be. A source whose `repeat` is 0 is left out."""
+    return {
         # views of one scan, turned and cropped: needs no known motion
         "scans": {"kind": "scans", "path": "", "repeat": 1},
         # a CSV list `source,target,16 numbers`, or HDF5
         "pairs": {"kind": "pairs", "path": "", "repeat": 0},
     }
-    config.data.validation = {
-        "scans": {"kind": "scans", "path": "", "repeat": 1},
-        "pairs": {"kind": "pairs", "path": "", "repeat": 0},
-    }
-    config.phases = ({"steps": 2000, "points": 1024, "neighbors": 32, "batch": 8},)
-    config.validate_every = 250
-
-    config.sampling.keep = (0.5, 0.9)
-    config.sampling.both_ways = 1.0
-    config.sampling.estimated_normals = 0.7  # of those that have normals; the rest always
-    config.sampling.noise = (0.0, 0.01)
-    config.sampling.outliers = (0.0, 0.03)
-    return config

@@ -1,16 +1,24 @@
 """What the tests of training share: a tiny corpus, a tiny recipe, and one compiled step."""
 
+import ast
+import dataclasses
 import functools
 
 import h5py
 import jax
 import numpy as np
-from ml_collections import ConfigDict
 
 from cfr_jax.networks import inputs
 from cfr_jax.networks.cfr import iterations
 from cfr_jax.networks.cfr import modules as network
 from cfr_jax.training import devices, step
+from cfr_jax.training.config import (
+    DataSection,
+    Phase,
+    SamplingSection,
+    TrainingConfig,
+    TrainSection,
+)
 from cfr_jax.training.optimizers import make_optimizer, make_schedule
 
 POINTS, NEIGHBORS, BATCH, STEPS, MAX_SKIPPED = 24, 6, 2, 16, 3
@@ -59,23 +67,28 @@ def write_corpus(path, shapes=4):
 
 def config(corpus_file):
     """A run of 16 steps that compiles to the recipe above."""
-    given = ConfigDict()
-    given.seed, given.network, given.iterations = 0, "cfr", 1
-    given.data = {"train": str(corpus_file), "validation": str(corpus_file)}
-    given.phases = (
-        {"steps": 2, "points": POINTS, "neighbors": NEIGHBORS, "batch": BATCH},
-        {"steps": STEPS - 2, "points": POINTS, "neighbors": NEIGHBORS, "batch": BATCH},
-    )
-    given.sampling = {"keep": (0.7, 0.7), "estimated_normals": 0.5}
-    given.train = {
-        "optimizer": "adamw", "schedule": "cosine", "peak_rate": 5e-3, "warmup": 0.1,
-        "cooldown": 0.2, "clip": 1.0, "weight_decay": 1e-5, "start_from": "",
-        "correspondence_weight": 0.05, "average_decay": 0.9, "pairs_at_once": 1, "workers": 2,
-        "precision": "float32", "max_skipped": MAX_SKIPPED,
-    }  # fmt: skip
-    given.log_every, given.checkpoint_every, given.validate_every = 4, 4, 4
-    given.validation_pairs, given.keep_checkpoints = 2, 2
-    return given
+    return TrainingConfig(
+        iterations=1,
+        data=DataSection(train=str(corpus_file), validation=str(corpus_file)),
+        phases=(Phase(2, POINTS, NEIGHBORS, BATCH), Phase(STEPS - 2, POINTS, NEIGHBORS, BATCH)),
+        sampling=SamplingSection(
+            keep=(0.7, 0.7), both_ways=0.0, near=0.0, centered=0.0, any_orientation=0.0,
+            scale=(1.0, 1.0), estimated_normals=0.5,
+        ),
+        train=TrainSection(
+            peak_rate=5e-3, average_decay=0.9, workers=2, max_skipped=MAX_SKIPPED
+        ),
+        log_every=4, checkpoint_every=4, validate_every=4, validation_pairs=2,
+    )  # fmt: skip
+
+
+def in_text(config):
+    """A config for another process; `from_text` reads it."""
+    return repr(dataclasses.asdict(config))
+
+
+def from_text(text):
+    return TrainingConfig(**ast.literal_eval(text))
 
 
 def cheap_validation(chosen, params, placed, truth, mesh):

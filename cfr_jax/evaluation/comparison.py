@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
+from ml_collections import ConfigDict
 from tqdm import tqdm
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation import machine, metrics
+from cfr_jax.evaluation.config import EvaluationConfig, checked
 from cfr_jax.evaluation.datasets import read_pairs
 from cfr_jax.evaluation.drawing.tables import Numbers, write_table
 from cfr_jax.evaluation.measuring import Measured, measure, only, summarize
@@ -24,7 +26,11 @@ from cfr_jax.runtime.atomic import write_atomically
 
 
 def compare(
-    config: Any, out: Path, names: Sequence[str] = (), plots: bool = True, command: str = ""
+    config: EvaluationConfig,
+    out: Path,
+    names: Sequence[str] = (),
+    plots: bool = True,
+    command: str = "",
 ) -> str:
     """Runs the methods called `names` (none: all of the config's) and writes into `out`.
 
@@ -33,13 +39,14 @@ def compare(
     where it stopped, and other methods or more pairs can join later. Raises ValueError for a config
     or data that cannot be used.
     """
+    config = checked(config)
     methods = methods_of(config, names, config.seed)
     if plots:
         from cfr_jax.evaluation.drawing.figures import draw_all, new_figure
         from cfr_jax.evaluation.drawing.gallery import draw_gallery
 
         new_figure(1, 1)  # better missed now than after all methods have run
-    pairs = read_pairs(config.data, config.limit, out / "cache")
+    pairs = read_pairs(ConfigDict(config.data), config.limit, out / "cache")
     held = {
         m.name: run_method(m, pairs, out / "parts" / f"{m.name}.json", config.timeout)
         for m in methods
@@ -83,7 +90,7 @@ def compare(
     return table
 
 
-def _summaries(measured: Sequence[Measured], config: Any) -> dict[str, Numbers]:
+def _summaries(measured: Sequence[Measured], config: EvaluationConfig) -> dict[str, Numbers]:
     return {m.name: summarize(m, config.thresholds, config.seed) for m in measured}
 
 
@@ -91,7 +98,7 @@ def _as_json(numbers: Numbers) -> dict[str, Any]:
     return {key: number and number._asdict() for key, number in numbers.items()}
 
 
-def _about(config: Any, count: int, command: str) -> dict[str, Any]:
+def _about(config: EvaluationConfig, count: int, command: str) -> dict[str, Any]:
     return {
         "title": config.title,
         "data": _told(config.data),
@@ -108,8 +115,8 @@ def _about(config: Any, count: int, command: str) -> dict[str, Any]:
     }
 
 
-def _told(data: Any) -> str:
-    return " ".join(f"{key}={value}" for key, value in data.to_dict().items())
+def _told(data: dict[str, Any]) -> str:
+    return " ".join(f"{key}={value}" for key, value in sorted(data.items()))
 
 
 def _of_pairs(

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.baselines import NAMES, baseline
+from cfr_jax.evaluation.config import EvaluationConfig
 from cfr_jax.evaluation.store import code_digest
 from cfr_jax.io import PointCloud
 from cfr_jax.io.cloud import usable_normals
@@ -20,7 +21,6 @@ from cfr_jax.io.cloud import usable_normals
 OWN = "cfr"
 NETWORKS = (OWN, "rpmnet")
 TRUTH = "truth"
-_FIELDS = {"use", "options", "weights", "threads", "batch", "estimated_normals", "modules"}
 # Whose seed changes the answer.
 _DRAWING = {"fgr", "fgr_icp", "ransac"}
 # Files that decide the answers of the peers, and of those methods that are made of our own code.
@@ -70,31 +70,26 @@ class Method:
     """Makes what times the parts of the method, in seconds a pair."""
 
 
-def methods_of(config: Any, names: Sequence[str], seed: int) -> list[Method]:
-    """The methods called `names` (none: all) in `config.methods`, in the order given.
+def methods_of(config: EvaluationConfig, names: Sequence[str], seed: int) -> list[Method]:
+    """The methods called `names` in `config.methods`, in the order given; all by name if none are.
 
-    Each entry says what to `use` (a name of `baselines.NAMES`, "truth", "cfr" or "rpmnet") with
-    which `options`; perhaps on how many `threads` and in what `batch`, and whether normals are to
-    be `estimated_normals` even where the pairs have them. A network may have `weights` of its own
-    instead of the config's, and its `modules` timed; where its own are not there, or RPM-Net's, the
-    method is left out. Raises ValueError for unknown methods, and for weights that are not sound.
+    Where weights of a network's own are not there, or RPM-Net's, the method is left out. Raises
+    ValueError for unknown methods, and for weights that are not sound.
     """
-    unknown = [name for name in names if name not in config.methods]
+    known = sorted(config.methods)
+    unknown = [name for name in names if name not in known]
     if unknown:
         raise ValueError(
-            f"methods: {', '.join(unknown)} not in the config, which has "
-            f"{', '.join(config.methods)}"
+            f"methods: {', '.join(unknown)} not in the config, which has {', '.join(known)}"
         )
-    return [_method(name, config, seed) for name in names or config.methods]
+    return [_method(name, config, seed) for name in names or known]
 
 
-def _method(name: str, config: Any, seed: int) -> Method:
-    entry = config.methods[name].to_dict()
-    if set(entry) - _FIELDS or "use" not in entry:
-        raise ValueError(f"methods.{name} has {sorted(entry)}, wanted `use` and any of {_FIELDS}")
-    use, options = entry["use"], dict(entry.get("options", {}))
-    estimated = bool(entry.get("estimated_normals", False))
-    batch, threads = entry.get("batch", 1), entry.get("threads", config.threads)
+def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
+    entry = config.methods[name]
+    use, options = entry.use, dict(sorted(entry.options.items()))
+    estimated, batch = entry.estimated_normals, entry.batch
+    threads = config.threads if entry.threads is None else entry.threads
     about: dict[str, Any] = {
         "use": use,
         "options": dict(options),
@@ -108,7 +103,7 @@ def _method(name: str, config: Any, seed: int) -> Method:
     if use in NETWORKS:
         from cfr_jax.weights.files import NoWeights, read_weights
 
-        own = entry.get("weights") or (None if use == OWN else config.rpmnet_weights)
+        own = entry.weights or (None if use == OWN else config.rpmnet_weights)
         source = own or config.weights
         try:
             weights = read_weights(source, use)
@@ -126,7 +121,7 @@ def _method(name: str, config: Any, seed: int) -> Method:
             seed=seed,
             **options,
         )
-        if entry.get("modules"):
+        if entry.modules:
             modules = functools.partial(
                 _make_modules, use, source, options.get("settings"), estimated
             )

@@ -6,7 +6,9 @@
 
 A checkpoint is written in `checkpoints/.unfinished`, its manifest last, and appears by a rename:
 a process killed at any moment leaves the ones before it as they were. One that is found damaged is
-renamed to `1500.damaged`, and the newest sound one before it is used.
+renamed to `1500.damaged`, and the newest sound one before it is used. (Orbax's CheckpointManager
+renames as well, but writes into a checkpoint after it calls back for the last time, so that no
+manifest could name all files.)
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ import orbax.checkpoint as ocp
 from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from cfr_jax.training import manifest
+from cfr_jax.runtime import manifest
 from cfr_jax.training.devices import agree, is_first, make_mesh
 from cfr_jax.training.step import TrainState
 
@@ -43,8 +45,6 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, keep: int):
-        if keep < 1:
-            raise ValueError(f"keep_checkpoints: got {keep}, wanted at least 1")
         self.folder, self._keep = Path(folder).absolute(), keep
         self._writer = ocp.StandardCheckpointer()
         self._thread = ThreadPoolExecutor(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.metadata
 import json
 import platform
@@ -14,6 +15,7 @@ import jax
 import numpy as np
 
 from cfr_jax import __version__
+from cfr_jax.training.config import TrainingConfig
 from cfr_jax.weights import files as weights
 
 _NAMED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -21,7 +23,7 @@ WEIGHTS = "weights.safetensors"  # the best so far
 _KEPT = ("step", "best", "validation", "position", "clock", "skipped")
 
 
-def begin(config: Any, stamps: dict[str, str]) -> dict:
+def begin(config: TrainingConfig, stamps: dict[str, str]) -> dict:
     """What a checkpoint says of itself, before the first step."""
     versions = {name: importlib.metadata.version(name) for name in _NAMED}
     versions |= {"cfr_jax": __version__, "python": platform.python_version()}
@@ -34,7 +36,7 @@ def begin(config: Any, stamps: dict[str, str]) -> dict:
         "random_key": np.asarray(jax.random.key_data(jax.random.key(config.seed))).tolist(),
         "skipped": 0,
         "clock": {"seconds": 0.0, "processor_seconds": 0.0},
-        "config": json.loads(json.dumps(config.to_dict())),
+        "config": json.loads(json.dumps(dataclasses.asdict(config))),
         "data": stamps,
         "versions": versions,
         "started": time.strftime("%Y-%m-%d %H:%M:%S %z"),
@@ -68,10 +70,10 @@ def go_on(before: dict, now: dict, total: int, workdir: Path) -> list[str]:
     return told
 
 
-def notes(config: Any, about: dict) -> dict[str, str]:
+def notes(config: TrainingConfig, about: dict) -> dict[str, str]:
     """What a weights file says of its own making."""
     return {
-        "config": json.dumps(config.to_dict(), sort_keys=True),
+        "config": json.dumps(dataclasses.asdict(config), sort_keys=True),
         "validation": json.dumps(about["best"]),
         "made_by": f"cfr_jax {__version__} train.py",
     }
@@ -93,7 +95,7 @@ def _changes(before: dict, now: dict) -> Iterator[str]:
 
 
 def _flat(tree: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(tree, dict) and tree:
+    if isinstance(tree, dict):  # an empty one says nothing
         for key, value in tree.items():
             yield from _flat(value, f"{name}.{key}" if name else key)
     elif isinstance(tree, list) and any(isinstance(value, dict) for value in tree):

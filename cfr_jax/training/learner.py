@@ -11,6 +11,7 @@ import jax
 from cfr_jax.networks import inputs, rpmnet
 from cfr_jax.networks.cfr import iterations
 from cfr_jax.networks.cfr import modules as network
+from cfr_jax.training.config import Phase, TrainingConfig
 from cfr_jax.training.step import Unroll
 
 AnySettings = inputs.Settings | rpmnet.RPMNetSettings
@@ -27,43 +28,22 @@ class Learner:
     validated: AnySettings
 
 
-@dataclasses.dataclass(frozen=True)
-class Phase:
-    """A stretch of the curriculum."""
-
-    steps: int
-    points: int
-    neighbors: int
-    batch: int
-    sampling: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Fields of `data.augment.Sampling` that differ from the config's in this phase."""
-
-    def __post_init__(self):
-        if self.steps < 0 or self.batch < 1:
-            raise ValueError(
-                f"phases: got {self.steps} steps of {self.batch} pairs, wanted 0 or more steps of "
-                "at least 1 pair"
-            )
-
-
-def learner(config: Any) -> Learner:
+def learner(config: TrainingConfig) -> Learner:
     """The network that `config.network` names: "cfr", or "rpmnet" to compare with.
 
     Raises ValueError for another, and for `config.settings` that it does not have.
     """
     if config.network == "cfr":
-        changed = dict(config.get("settings", {}))
+        changed = config.settings
         _check_settings(changed)
         return Learner(
-            fresh=lambda key: network.init_params(
-                key, config.iterations, config.get("shared", False)
-            ),
+            fresh=lambda key: network.init_params(key, config.iterations, config.shared),
             unroll=iterations.unroll,
             trained=lambda count: inputs.Settings(neighbors=count, detach_motion=True, **changed),
             validated=inputs.Settings(**changed),
         )
     if config.network == "rpmnet":
-        if changed := dict(config.get("settings", {})):
+        if changed := config.settings:
             raise ValueError(f"settings: got {', '.join(changed)}, wanted none for rpmnet")
         return Learner(
             fresh=rpmnet.init_params,

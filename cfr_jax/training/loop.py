@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from cfr_jax.data.loader import batches
 from cfr_jax.training import devices, identity, step, stopping, validation
 from cfr_jax.training.checkpoints import Checkpoints
-from cfr_jax.training.learner import Phase, remaining
+from cfr_jax.training.config import Phase, TrainingConfig
+from cfr_jax.training.learner import remaining
 from cfr_jax.training.reporting.reporter import Reporter
 from cfr_jax.training.step import TrainState
 from cfr_jax.training.task import Task, fresh_params, prepare
 from cfr_jax.weights import files as weights
 
 
-def run(config: Any, workdir: Path) -> dict:
+def run(config: TrainingConfig, workdir: Path) -> dict:
     """Trains by `config` in `workdir`, going on where a checkpoint there left off.
 
     Writes `checkpoints/`, `metrics.jsonl` (a line each time something is measured),
@@ -54,7 +54,7 @@ def run(config: Any, workdir: Path) -> dict:
 class _Training:
     """A run from its start, or from a checkpoint, to its end; `about` tells where it is."""
 
-    config: Any
+    config: TrainingConfig
     workdir: Path
     task: Task
     state: TrainState

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,18 +13,10 @@ from jax.sharding import Mesh
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.loader import Mixture
 from cfr_jax.data.making.build import ENOUGH
-from cfr_jax.training import devices, optimizers, sources, step
-from cfr_jax.training.learner import Learner, Phase, learner
+from cfr_jax.training import devices, optimizers, sources
+from cfr_jax.training.config import Phase, TrainingConfig, checked
+from cfr_jax.training.learner import Learner, learner
 from cfr_jax.weights import files as weights
-
-_FIELDS = (
-    "seed", "network", "iterations", "data.train", "data.validation", "phases", "sampling",
-    "train.optimizer", "train.schedule", "train.peak_rate", "train.warmup", "train.cooldown",
-    "train.clip", "train.weight_decay", "train.correspondence_weight", "train.average_decay",
-    "train.precision", "train.pairs_at_once", "train.max_skipped", "train.workers",
-    "train.start_from", "log_every", "checkpoint_every", "validate_every", "validation_pairs",
-    "keep_checkpoints",
-)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -53,29 +44,22 @@ class Task:
         return sum(phase.steps for phase in self.phases)
 
 
-def prepare(config: Any, workdir: Path) -> Task:
+def prepare(config: TrainingConfig, workdir: Path) -> Task:
     """The task of a config; refined truths, and that all scans can be read, are kept in `workdir`.
 
     Raises ValueError, naming the field, where the config cannot be used, the data cannot be read,
     or training and validation share a scan.
     """
-    _check_fields(config)
+    config = checked(config)
     chosen, mesh = learner(config), devices.make_mesh()
-    phases = tuple(_made(Phase, dict(phase), "phases") for phase in config.phases)
-    for phase in phases:
+    for phase in config.phases:
         devices.check_batch(phase.batch, config.train.pairs_at_once, mesh)
-    samplings = tuple(
-        _sampling(phase, chosen.validated.radius, config.sampling.to_dict() | phase.sampling)
-        for phase in phases
-    )
-    if config.train.precision not in step.PRECISIONS:
-        raise ValueError(
-            f"precision: got {config.train.precision!r}, wanted one of {', '.join(step.PRECISIONS)}"
-        )
+    radius = chosen.validated.radius
+    samplings = tuple(config.sampling_of(phase, radius) for phase in config.phases)
     schedule = optimizers.make_schedule(
         config.train.schedule,
         peak_rate=config.train.peak_rate,
-        steps=sum(phase.steps for phase in phases),
+        steps=sum(phase.steps for phase in config.phases),
         warmup=config.train.warmup,
         cooldown=config.train.cooldown,
     )
@@ -95,12 +79,12 @@ def prepare(config: Any, workdir: Path) -> Task:
         config.validation_pairs,
         samplings[-1],
         chosen.validated.neighbors,
-        chosen.validated.radius,
+        radius,
     )
     return Task(
         learner=chosen,
         mesh=mesh,
-        phases=phases,
+        phases=config.phases,
         samplings=samplings,
         mixture=mixture,
         pairs=pairs,
@@ -114,7 +98,7 @@ def prepare(config: Any, workdir: Path) -> Task:
     )
 
 
-def fresh_params(config: Any, chosen: Learner) -> dict:
+def fresh_params(config: TrainingConfig, chosen: Learner) -> dict:
     """The weights that a run begins with: those of `train.start_from`, or random ones.
 
     Raises ValueError where those do not have the iterations that the config asks for.
@@ -131,43 +115,6 @@ def fresh_params(config: Any, chosen: Learner) -> dict:
             "says otherwise (or the other way round); set both as they were"
         )
     return params
-
-
-def _check_fields(config):
-    def lacks(name):
-        room, _, field = name.rpartition(".")
-        return field not in (config.get(room, {}) if room else config)
-
-    if lacking := [name for name in _FIELDS if lacks(name)]:
-        raise ValueError(
-            f"config: lacks {', '.join(lacking)}; configs/open_cad.py says what they are"
-        )
-    counts = "log_every", "checkpoint_every", "validate_every", "validation_pairs"
-    for field in (*counts, "keep_checkpoints"):
-        if config[field] < 1:
-            raise ValueError(f"{field}: got {config[field]}, wanted at least 1")
-    for field, least in (("workers", 1), ("max_skipped", 0)):
-        if config.train[field] < least:
-            raise ValueError(f"{field}: got {config.train[field]}, wanted at least {least}")
-
-
-def _sampling(phase, radius, fields):
-    # neighbors are found on the host: within the network's radius, as many as the phase says
-    if wrong := fields.keys() & {"points", "neighbors", "radius"}:
-        raise ValueError(
-            f"sampling: got {', '.join(sorted(wrong))}; points and neighbors stand in a phase, the "
-            "radius in config.settings"
-        )
-    given = {"points": phase.points, "neighbors": phase.neighbors, "radius": radius}
-    return _made(Sampling, given | fields, "sampling")
-
-
-def _made(kind, fields, where):
-    """What a config file describes by `fields`; one of its author's own may have others."""
-    try:
-        return kind(**fields)
-    except TypeError as error:
-        raise ValueError(f"{where}: {error}") from error
 
 
 def _told(config, mixture, held_out, count, workdir):

@@ -121,13 +121,13 @@ def test_no_config_gives_a_baseline_an_option_that_it_does_not_take(path):
 
     from cfr_jax.evaluation.baselines import NAMES, baseline
 
-    for name, entry in read_config(path).methods.to_dict().items():
-        if entry["use"] not in NAMES:
+    for name, entry in read_config(path).methods.items():
+        if entry.use not in NAMES:
             continue
-        taken = inspect.signature(baseline(entry["use"])).parameters
+        taken = inspect.signature(baseline(entry.use)).parameters
         if any(p.kind is p.VAR_KEYWORD for p in taken.values()):
             taken = {**taken, **inspect.signature(baseline("fgr")).parameters}
-        options = set(entry.get("options", {}))
+        options = set(entry.options)
         assert options <= set(taken), name
         needed = {k for k, p in taken.items() if p.default is p.empty} - {"source", "target"}
         assert needed - {"options"} <= options, name
@@ -135,17 +135,15 @@ def test_no_config_gives_a_baseline_an_option_that_it_does_not_take(path):
 
 def test_without_normals_the_methods_are_the_same_and_none_is_given_any():
     config = read_module(ROOT / "configs" / "eval_open_cad.py")
-    exact, estimated = (
-        config.get_config(kind).methods.to_dict() for kind in ("exact", "estimated")
-    )
+    exact, estimated = (config.get_config(kind).methods for kind in ("exact", "estimated"))
 
     # all but those that take no normals, and RPM-Net, whose answers are those of `rpmnet_optim`
     without = {"identity", "truth", "icp", "gicp", "kiss_matcher", "rpmnet"}
     assert set(estimated) == {f"{name}_estimated" for name in set(exact) - without}
     for name, entry in estimated.items():
-        assert entry["estimated_normals"] is True
-        assert entry["use"] == exact[name.removesuffix("_estimated")]["use"]
-    assert not any(entry.get("estimated_normals") for entry in exact.values())
+        assert entry.estimated_normals is True
+        assert entry.use == exact[name.removesuffix("_estimated")].use
+    assert not any(entry.estimated_normals for entry in exact.values())
     assert len(methods_of(config.get_config("estimated"), [], seed=0)) == len(estimated)
 
 
@@ -158,11 +156,12 @@ def test_what_an_ablation_trains_is_what_it_measures():
         config = evaluations.get_config(name)
         assert len(config.methods) == len(variants) == 2
         for method, (run, settings) in variants.items():
-            entry = config.methods[method].to_dict()
-            made = make_network(network="cfr", weights="object", **entry["options"])
+            entry = config.methods[method]
+            made = make_network(network="cfr", weights="object", **entry.options)
             measured = made.args[1].settings
             if run:
-                assert entry["weights"] == f"{config.runs}/{run}/weights.safetensors"
+                assert run in evaluations.trainings(name)
+                assert entry.weights == f"{evaluations.workdir(run)}/weights.safetensors"
                 assert learner(trainings.get_config(run)).validated == measured, method
             for field, value in settings.items():
                 assert getattr(measured, field) == value

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation import store
+from cfr_jax.evaluation.config import EvaluationConfig, MethodEntry, checked
 from cfr_jax.evaluation.datasets import read_pairs
 from cfr_jax.evaluation.drawing.tables import write_table
 from cfr_jax.evaluation.measuring import measure, only, summarize
@@ -323,19 +324,66 @@ def test_normals_are_withheld_where_they_are_unusable_or_not_wanted():
     assert all(cloud.normals is None for cloud in clouds_of(pair, estimated=True))
 
 
+def config(**fields):
+    return EvaluationConfig("t", {"kind": "corpus", "path": "nowhere.h5"}, **fields)
+
+
+def test_a_config_with_an_unknown_method_is_refused():
+    given = config(methods={"m": MethodEntry("magic")})
+    with pytest.raises(ValueError, match="methods.m.use is 'magic'"):
+        methods_of(given, [], seed=0)
+    with pytest.raises(ValueError, match="methods: n not in the config, which has m"):
+        methods_of(given, ["n"], seed=0)
+
+
 @pytest.mark.parametrize(
-    ("entry", "message"),
+    ("change", "wanted"),
     [
-        ({"use": "magic"}, "methods.m.use is 'magic'"),
-        ({"uses": "icp"}, r"methods.m has \['uses'\], wanted `use`"),
+        ({"limit": -1}, "limit: got -1, wanted 0 or more"),
+        ({"threads": -1}, "threads: got -1, wanted 0 or more"),
+        ({"seed": "0"}, "seed: got '0', wanted a whole number"),
+        ({"limit": True}, "limit: got True, wanted a whole number"),
+        ({"limits": (15.0,)}, r"limits: got \(15.0,\), wanted degrees and a length"),
+        ({"thresholds": (5.0, 0.1)}, "thresholds: got 5.0, wanted degrees and a length"),
+        ({"methods": {"m": {"use": "icp"}}}, "methods.m: got .*, wanted a MethodEntry"),
     ],
 )
-def test_a_config_with_an_unknown_method_is_refused(entry, message):
-    config = ConfigDict({"methods": {"m": entry}, "threads": 1})
-    with pytest.raises(ValueError, match=message):
-        methods_of(config, [], seed=0)
-    with pytest.raises(ValueError, match="methods: n not in the config, which has m"):
-        methods_of(config, ["n"], seed=0)
+def test_what_an_evaluation_is_told_wrong_is_named(unchecked, change, wanted):
+    given = config(methods={})
+    for name, value in change.items():
+        setattr(given, name, value)
+    with pytest.raises(ValueError, match=wanted):
+        checked(given)
+
+
+@pytest.mark.parametrize(
+    ("fields", "wanted"),
+    [
+        ({"batch": 0}, "methods: batch: got 0"),
+        ({"threads": "2"}, "threads: got '2', wanted a whole number or None"),
+        ({"modules": 1}, "modules: got 1, wanted True or False"),
+    ],
+)
+def test_what_a_method_is_told_wrong_is_named(unchecked, fields, wanted):
+    entry = MethodEntry("cfr")
+    for name, value in fields.items():
+        setattr(entry, name, value)
+    with pytest.raises(ValueError, match=wanted):
+        checked(config(methods={"m": entry}))
+
+
+def test_what_is_no_config_of_an_evaluation_is_refused(unchecked):
+    with pytest.raises(ValueError, match="config: got ConfigDict, wanted EvaluationConfig"):
+        checked(ConfigDict({"title": "t"}))
+
+
+def test_an_option_that_is_set_for_one_method_is_that_of_no_other():
+    shared = {"start": "centroid"}
+    given = config(methods={"icp": MethodEntry("icp", shared), "gicp": MethodEntry("gicp", shared)})
+
+    given.methods["icp"].options["start"] = "identity"
+
+    assert checked(given).methods["gicp"].options == {"start": "centroid"}
 
 
 def test_a_worker_imports_nothing_numerical_before_it_limits_its_threads():
@@ -598,31 +646,27 @@ def test_each_module_is_counted_as_often_as_it_runs(
 
 
 def test_weights_that_are_not_there_leave_their_method_out_and_no_other(tmp_path):
-    config = ConfigDict(
-        {
-            "weights": "object",
-            "rpmnet_weights": str(tmp_path / "nowhere.safetensors"),
-            "threads": 1,
-            "methods": {
-                "rpmnet": {"use": "rpmnet", "options": {"refine": False}},
-                "mine": {"use": "cfr", "options": {"refine": False}, "weights": "nobody"},
-                "cfr": {"use": "cfr", "options": {"refine": False}},
-            },
-        }
+    given = config(
+        rpmnet_weights=str(tmp_path / "nowhere.safetensors"),
+        methods={
+            "rpmnet": MethodEntry("rpmnet", {"refine": False}),
+            "mine": MethodEntry("cfr", {"refine": False}, weights="nobody"),
+            "cfr": MethodEntry("cfr", {"refine": False}),
+        },
     )
-    rpmnet, mine, cfr = methods_of(config, ["rpmnet", "mine", "cfr"], seed=0)
+    rpmnet, mine, cfr = methods_of(given, ["rpmnet", "mine", "cfr"], seed=0)
     assert "nowhere.safetensors" in rpmnet.missing and "nobody" in mine.missing
     assert cfr.missing is None
     held = run_method(mine, [a_pair()], tmp_path / "part.json", timeout=1.0)
     assert held.missing == mine.missing and not held.by_pair
 
     # weights of the other network are an error, and so is a missing file that was asked for
-    config.rpmnet_weights = "object"
+    given.rpmnet_weights = "object"
     with pytest.raises(ValueError, match="holds the network CFR, wanted RPM-Net"):
-        methods_of(config, ["rpmnet"], seed=0)
-    config.weights = "nobody"
+        methods_of(given, ["rpmnet"], seed=0)
+    given.weights = "nobody"
     with pytest.raises(ValueError, match="no shipped weights called 'nobody'"):
-        methods_of(config, ["cfr"], seed=0)
+        methods_of(given, ["cfr"], seed=0)
 
 
 def test_the_errors_without_some_pairs_are_those_of_the_others():

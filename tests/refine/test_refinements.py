@@ -44,9 +44,7 @@ def toy(source, target, initial):
 def shift(source, target, initial):
     """Lays centroid on centroid, as JAX traces it."""
     assert isinstance(source, Surface)
-    middles = [
-        jnp.mean(side.points, axis=0, where=side.mask[:, None]) for side in (source, target)
-    ]
+    middles = [jnp.mean(side.points, axis=0, where=side.mask[:, None]) for side in (source, target)]
     moved = initial.at[:3, 3].set(middles[1] - initial[:3, :3] @ middles[0])
     return Fit(moved, jnp.array(True), jnp.array(True), jnp.array(1, jnp.int32))
 

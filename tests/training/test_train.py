@@ -30,6 +30,8 @@ def command(folder, *more):
         ("--config.train.peek_rate=1", 'Did you mean "peak_rate"'),
         ("--config.phases.0.steps=20", "'--config.phases[0].steps=20'"),
         ("--config.phases[4].steps=20", "out of range"),
+        ("--config.dta.train=a.h5", 'TrainingConfig has no field "dta". Did you mean "data"'),
+        ("--config.zz=1", 'has no field "zz". It has seed, network'),
         ("--config.sampling.keep=0.5", "keep: got (0.5,), wanted two numbers"),
         ("--config.data.train=nowhere.h5", "nowhere.h5"),
     ],

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cfr_jax.training import manifest
+from cfr_jax.runtime import manifest
 from cfr_jax.training.checkpoints import Checkpoints, SaveError
 from cfr_jax.training.step import TrainState
 

@@ -11,9 +11,9 @@ import jax
 import numpy as np
 import pytest
 import training_samples as samples
-from ml_collections import ConfigDict
 
 from cfr_jax.training import devices
+from cfr_jax.training.config import Phase
 
 HERE = Path(__file__).parent
 
@@ -21,7 +21,7 @@ HERE = Path(__file__).parent
 def config(folder):
     """Four steps of eight pairs, small enough to compile quickly."""
     given = samples.config(samples.write_corpus(folder / "ellipsoids.h5"))
-    given.phases = ({"steps": 4, "points": 24, "neighbors": 6, "batch": 8},)
+    given.phases = (Phase(steps=4, points=24, neighbors=6, batch=8),)
     given.log_every = given.checkpoint_every = 1
     given.validate_every = 4
     return given
@@ -36,7 +36,7 @@ def start(folder, workdir, devices=1, *, stop_after=0, **group):
         "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
-    given = json.dumps(config(folder).to_dict())
+    given = samples.in_text(config(folder))
     order = json.dumps({"workdir": str(workdir), "stop_after": stop_after, "group": group})
     return subprocess.Popen(
         [sys.executable, __file__, given, order],
@@ -168,7 +168,7 @@ def main(given: str, order: str) -> None:
     """Trains; stops without a word after so many steps."""
     from cfr_jax.training import loop, step, validation
 
-    given, order = ConfigDict(json.loads(given)), json.loads(order)
+    given, order = samples.from_text(given), json.loads(order)
     if order["group"]:
         devices.join(**order["group"])
     validation.validate = samples.cheap_validation

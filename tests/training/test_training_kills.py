@@ -12,10 +12,10 @@ from pathlib import Path
 import jax
 import pytest
 import training_samples as samples
-from ml_collections import ConfigDict
 from training_samples import assert_same
 
 from cfr_jax.training.checkpoints import Checkpoints
+from cfr_jax.training.config import Phase
 from cfr_jax.weights import files as weights
 
 HERE = Path(__file__).parent
@@ -30,7 +30,7 @@ def start(given, workdir):
         "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
-    order = json.dumps(given.to_dict()), str(workdir)
+    order = samples.in_text(given), str(workdir)
     return subprocess.Popen(
         [sys.executable, __file__, *order],
         env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -40,7 +40,7 @@ def start(given, workdir):
 @pytest.mark.slow
 def test_a_run_killed_at_random_moments_ends_bit_equal(tmp_path):
     given = samples.config(samples.write_corpus(tmp_path / "ellipsoids.h5"))
-    given.phases = ({"steps": 60, "points": 24, "neighbors": 6, "batch": 2},)
+    given.phases = (Phase(steps=60, points=24, neighbors=6, batch=2),)
     given.checkpoint_every, given.validate_every = 3, 9
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     process = start(given, whole)
@@ -101,7 +101,7 @@ def main(given: str, workdir: str) -> None:
     from cfr_jax.training import loop, validation
 
     validation.validate = samples.cheap_validation
-    loop.run(ConfigDict(json.loads(given)), Path(workdir))
+    loop.run(samples.from_text(given), Path(workdir))
 
 
 if __name__ == "__main__":

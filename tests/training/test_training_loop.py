@@ -1,5 +1,6 @@
 """A whole training: it resumes bit for bit, leaves what it measured, and says why it stops."""
 
+import copy
 import json
 import os
 import signal
@@ -11,8 +12,18 @@ import training_samples as samples
 from training_samples import assert_same, config
 
 from cfr_jax.data.augment import Sampling
-from cfr_jax.training import devices, learner, loop, optimizers, step, stopping, validation
+from cfr_jax.training import (
+    devices,
+    identity,
+    learner,
+    loop,
+    optimizers,
+    step,
+    stopping,
+    validation,
+)
 from cfr_jax.training.checkpoints import Checkpoints, SaveError
+from cfr_jax.training.config import Phase
 from cfr_jax.training.reporting.board import Board
 from cfr_jax.training.reporting.reporter import Reporter
 from cfr_jax.training.stopping import Stopped
@@ -118,7 +129,7 @@ def test_the_weights_are_those_that_the_newest_checkpoint_calls_best(
     assert int(state_of(tmp_path).step) == 4  # the checkpoint came first
 
     given = config(corpus_file)
-    given.phases = ({"steps": 4, "points": 24, "neighbors": 6, "batch": 2},)
+    given.phases = (Phase(steps=4, points=24, neighbors=6, batch=2),)
     best = run(given, tmp_path)  # nothing is left to do but this
 
     assert best["step"] == 4
@@ -185,6 +196,18 @@ def test_another_config_goes_on_with_a_word(killed_config, tmp_path, capsys):
     told = capsys.readouterr().out
     assert "going on from step 4" in told and "keep_checkpoints 2 → 3" in told
     assert int(state_of(tmp_path).step) == 16
+
+
+def test_a_run_from_before_phases_had_samplings_goes_on_without_a_word(corpus_file, tmp_path):
+    stamps = {"data.train": "a", "data.validation": "b"}
+    now = identity.begin(config(corpus_file), stamps)
+    before = copy.deepcopy(now) | {"step": 4}
+    for phase in before["config"]["phases"]:
+        assert phase.pop("sampling") == {}
+
+    told = identity.go_on(before, now, 16, tmp_path)
+
+    assert told == ["going on from step 4"] and now["step"] == 4
 
 
 def test_a_workdir_of_other_training_data_is_refused(tmp_path, whole):
@@ -327,7 +350,7 @@ def test_a_run_cut_short_before_its_first_validation_is_validated(
     killed_in_step(6)
     with pytest.raises(Killed):
         run(given, tmp_path)
-    given.phases = ({"steps": 4, "points": 24, "neighbors": 6, "batch": 2},)
+    given.phases = (Phase(steps=4, points=24, neighbors=6, batch=2),)
 
     best = run(given, tmp_path)
 
@@ -366,7 +389,7 @@ def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monk
 
     def full_after_step_8(self, number, *rest):
         if number > 8:
-            monkeypatch.setattr("cfr_jax.training.manifest.write", no_space)
+            monkeypatch.setattr("cfr_jax.runtime.manifest.write", no_space)
         finish(self, number, *rest)
 
     def no_space(folder):
@@ -387,69 +410,6 @@ def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monk
 
     assert run(given, tmp_path) == whole[1]
     assert_same(state_of(tmp_path), state_of(whole[0]))
-
-
-@pytest.mark.parametrize(
-    ("change", "wanted"),
-    [
-        ({"network": "dcp"}, "network: got 'dcp'"),
-        ({"train.optimizer": "adagrad"}, "optimizer: got 'adagrad'"),
-        ({"train.schedule": "step"}, "schedule: got 'step'"),
-        ({"train.precision": "float16"}, "precision: got 'float16'"),
-        ({"train.pairs_at_once": 0}, "pairs_at_once: got 0"),
-        ({"train.workers": 0}, "workers: got 0"),
-        ({"train.max_skipped": -1}, "max_skipped: got -1"),
-        ({"log_every": 0}, "log_every: got 0"),
-        ({"validation_pairs": 0}, "validation_pairs: got 0"),
-        ({"settings": {"neighbors": 5}}, "settings: got neighbors, wanted some of .*radius"),
-        ({"sampling.radius": 0.2}, "sampling: got radius; .* the radius in config.settings"),
-        ({"network": "rpmnet", "settings": {"radius": 0.2}}, "settings: got radius, wanted none"),
-        ({"keep_checkpoints": 0}, "keep_checkpoints: got 0"),
-        ({"data.train": "nowhere.h5"}, "nowhere.h5"),
-        ({"sampling.keep": (0.0, 2.0)}, "keep"),
-        ({"sampling.keep": (0.5, 0.3)}, "keep: got .*the lower one first"),
-        ({"sampling.angle": -5.0}, "angle, translation: got -5.0"),
-    ],
-)
-def test_what_a_config_has_wrong_is_named(corpus_file, tmp_path, change, wanted):
-    given = config(corpus_file)
-    for name, value in change.items():
-        with given.ignore_type():
-            given.update_from_flattened_dict({name: value})
-
-    with pytest.raises(ValueError, match=wanted), jax.numpy_dtype_promotion("standard"):
-        loop.run(given, tmp_path)
-
-
-def test_a_config_that_lacks_fields_is_told_which(corpus_file, tmp_path):
-    given = config(corpus_file)
-    del given.seed, given.train.clip, given.data
-
-    with pytest.raises(
-        ValueError, match="lacks seed, data.train, data.validation, train.clip; .*open_cad.py"
-    ):
-        prepare(given, tmp_path)
-
-
-def test_a_phase_may_be_sampled_in_its_own_way(corpus_file, tmp_path):
-    given = config(corpus_file)
-    given.phases[1]["sampling"] = {"estimated_normals": 1.0}
-
-    first, second = prepare(given, tmp_path).samplings
-
-    assert (first.estimated_normals, second.estimated_normals) == (0.5, 1.0)
-    assert first.keep == second.keep == (0.7, 0.7)
-    assert first.radius == 0.3
-    given.phases[1]["sampling"] = {"estimated": 1.0}
-    with pytest.raises(ValueError, match="sampling: .*'estimated'"):
-        prepare(given, tmp_path)
-    given.phases[0]["step"] = 3
-    with pytest.raises(ValueError, match="phases: .*'step'"):
-        prepare(given, tmp_path)
-    given = config(corpus_file)
-    given.phases[1]["steps"] = -1
-    with pytest.raises(ValueError, match="phases: got -1 steps"):
-        prepare(given, tmp_path)
 
 
 def test_neighbors_are_trained_on_within_the_radius_that_is_validated(corpus_file, tmp_path):
@@ -488,6 +448,6 @@ def test_validation_measures_the_last_transform(corpus_file, monkeypatch):
     [(0, [(3, 0), (5, 0)]), (2, [(3, 2), (5, 0)]), (3, [(5, 0)]), (7, [(5, 4)]), (8, [])],
 )
 def test_the_curriculum_goes_on_within_its_phases(done, left):
-    phases = [learner.Phase(3, 24, 6, 4), learner.Phase(5, 24, 6, 2)]
+    phases = [Phase(3, 24, 6, 4), Phase(5, 24, 6, 2)]
 
     assert [(phase.steps, ran) for phase, ran in learner.remaining(phases, done)] == left

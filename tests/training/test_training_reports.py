@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 
 from cfr_jax.training.losses import PairLoss
-from cfr_jax.training.reporting import board, log
+from cfr_jax.training.reporting import board, charts, log
 from cfr_jax.training.reporting.summary import write_summary
 from cfr_jax.viewer.scene import Scene
 
 L = 2
+VALIDATION = {
+    "rotation_mean": 3.0, "rotation_median": 1.0, "translation_mean": 0.1, "recall_5deg_0.1": 0.5,
+    "rotation_by_iteration": [2.0, 1.0],
+}  # fmt: skip
 
 
 def measured(value):
@@ -121,6 +125,26 @@ def test_the_page_draws_as_many_iterations_as_there_are(tmp_path, about):
     assert page.count("iteration 7") == 2
 
 
+def test_the_page_and_tensorboard_draw_the_same_numbers():
+    lines = [line(2), {"step": 2, "validation": VALIDATION}, line(4)]
+    found = [(each["step"], charts.scalars(each)) for each in lines]
+
+    drawn = charts.charts(lines)
+
+    assert found[1][1] == {
+        "validation/rotation_mean": 3.0, "validation/rotation_median": 1.0,
+        "validation/translation_mean": 0.1, "validation/recall_5deg_0.1": 0.5,
+        "validation/rotation/1": 2.0, "validation/rotation/2": 1.0,
+    }  # fmt: skip
+    assert found[0][1]["training/rotation_error/2"] == lines[0]["rotation_error"][1]
+    errors = next(chart for chart in drawn if chart.title == "Rotation error")
+    assert [curve.steps for curve in errors.curves] == [[2, 4], [2], [2]]
+    assert errors.curves[0].values == [each["rotation_error"][-1] for each in (lines[0], lines[2])]
+    assert errors.curves[1].values == [3.0] and errors.curves[2].values == [1.0]
+    known = {value for _, numbers in found for value in numbers.values()}
+    assert {value for chart in drawn for curve in chart.curves for value in curve.values} <= known
+
+
 def test_a_full_disk_is_told_by_the_board_and_nothing_waits_for_it(tmp_path):
     pytest.importorskip("tensorboardX")
     written = board.Board(tmp_path / "tensorboard", 0)
@@ -138,7 +162,7 @@ def test_a_full_disk_is_told_by_the_board_and_nothing_waits_for_it(tmp_path):
 def test_without_matplotlib_there_are_no_pictures_and_it_is_told(tmp_path, monkeypatch):
     pytest.importorskip("tensorboardX")
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    found = {name: 1.0 for name in board._VALIDATIONS} | {"rotation_by_iteration": [2.0, 1.0]}
+    found = VALIDATION
 
     written = board.Board(tmp_path, 0)
     cloud = np.zeros((3, 3))
@@ -161,7 +185,7 @@ def test_tensorboard_gets_scalars_histograms_and_pictures(tmp_path):
     written = board.Board(tmp_path, 0)
     cloud = np.random.default_rng(0).normal(size=(30, 3))
     scene = Scene(cloud, cloud, np.stack([np.eye(4)] * 2), ["start", "1"])
-    found = {name: 1.0 for name in board._VALIDATIONS} | {"rotation_by_iteration": [2.0, 1.0]}
+    found = VALIDATION
     written.training(line(2), [measured(1.0)])
     written.validation(2, found, [("pair_0", scene)])
     written.close()

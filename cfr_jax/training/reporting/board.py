@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 
 from cfr_jax.training.losses import PairLoss
+from cfr_jax.training.reporting.charts import scalars
 from cfr_jax.training.reporting.log import writing
 from cfr_jax.viewer.picture import write_picture
 from cfr_jax.viewer.scene import Scene
 
-_SCALARS = ("loss", "pose", "correspondence", "learning_rate", "steps_per_second", "skipped")
-_VALIDATIONS = ("rotation_mean", "rotation_median", "translation_mean", "recall_5deg_0.1")
 _BINS = 30  # of a histogram
 MISSING = 'no TensorBoard files: pip install "cfr_jax[train]" to have them'
 NO_PICTURES = 'no pictures among the TensorBoard files: pip install "cfr_jax[viz]" to have them'
@@ -60,12 +59,7 @@ class Board:
             return
         step = line["step"]
         with writing(self._folder):
-            for name in _SCALARS:
-                if name in line:  # there are no means where no pair was sound
-                    self._scalar(f"training/{name}", line[name], step)
-            for name in ("rotation_error", "translation_error"):
-                for i, value in enumerate(line.get(name, ()), start=1):
-                    self._scalar(f"training/{name}/{i}", value, step)
+            self._scalars(line, step)
             for name in ("alpha", "beta"):
                 spread = np.concatenate([np.asarray(getattr(each, name)) for each in measured])
                 for i, values in enumerate(spread.T, start=1):
@@ -84,10 +78,7 @@ class Board:
             if self._draws
         ]
         with writing(self._folder):
-            for name in _VALIDATIONS:
-                self._scalar(f"validation/{name}", found[name], step)
-            for i, value in enumerate(found["rotation_by_iteration"], start=1):
-                self._scalar(f"validation/rotation/{i}", value, step)
+            self._scalars({"validation": found}, step)
             for picture in drawn:
                 self._add(step, summary=picture)
             self._events.flush()
@@ -98,8 +89,9 @@ class Board:
             with writing(self._folder):
                 self._events.close()
 
-    def _scalar(self, name, value, step):
-        self._add(step, summary=self._summary.scalar(name, value))
+    def _scalars(self, line, step):
+        for tag, value in scalars(line).items():
+            self._add(step, summary=self._summary.scalar(tag, value))
 
     def _add(self, step, **content):
         self._events.write_event(self._event(step=step, wall_time=time.time(), **content))

@@ -9,8 +9,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from cfr_jax.training.config import Phase
 from cfr_jax.training.devices import is_first
-from cfr_jax.training.learner import Phase
 from cfr_jax.training.losses import PairLoss
 from cfr_jax.training.reporting.board import Board
 from cfr_jax.training.reporting.log import Bar, Clock, MetricsLog, read_journal, summarize

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.training.reporting.charts import Chart, charts
 
 _WIDTH, _HEIGHT, _LEFT, _BELOW, _ABOVE = 460, 220, 52, 28, 14
 _COLORS = ("#0a6ebd", "#d9822b", "#2e8b57", "#8e44ad", "#7f8c8d")
@@ -20,22 +21,12 @@ figcaption { font-weight: 600; } svg { background: #fafbfc; border: 1px solid #e
 td, th { text-align: left; padding: .15rem 1.2rem .15rem 0; font-variant-numeric: tabular-nums; }
 pre { background: #fafbfc; border: 1px solid #e3e6ea; padding: .6rem; overflow-x: auto; }
 """
-_ANNEALING = {
-    "beta": "beta: how sharply affinities fall with the distance of the features",
-    "alpha": "alpha: the squared distance up to which points match",
-}
-Curve = tuple[str, Sequence[int], Sequence[float]]
-"""A name, steps, values."""
 
 
 def write_summary(path: Path, lines: Sequence[dict], about: dict) -> None:
     """The curves of a journal's `lines`, the best validation, the time used and the config of
     `about` (what a checkpoint says of itself)."""
-    body = "".join(
-        _figure(title, unit, curves)
-        for title, unit, curves in _figures(lines)
-        if any(len(steps) for _, steps, _ in curves)
-    )
+    body = "".join(_figure(chart) for chart in charts(lines))
     best = about["best"]
     rows = {
         "trained on": about["data"]["data.train"],
@@ -65,63 +56,9 @@ def write_summary(path: Path, lines: Sequence[dict], about: dict) -> None:
     write_atomically(path, page.encode())
 
 
-def _figures(lines):
-    training = [line for line in lines if "loss" in line]
-    held = [(line["step"], line["validation"]) for line in lines if "validation" in line]
-
-    def of(name, key, pick=lambda value: value):
-        known = [(line["step"], pick(line[key])) for line in training if key in line]
-        return (name, [step for step, _ in known], [value for _, value in known])
-
-    def tested(name, key, pick=lambda value: value):
-        known = [(step, pick(found[key])) for step, found in held if key in found]
-        return (name, [step for step, _ in known], [value for _, value in known])
-
-    iterations = range(len(training[-1]["beta"])) if training else ()
-    return [
-        (
-            "Loss",
-            "",
-            [
-                of("all", "loss"),
-                of("motion and slack", "pose"),
-                of("correspondences, before their weight", "correspondence"),
-            ],
-        ),
-        (
-            "Rotation error",
-            "degrees",
-            [
-                of("training", "rotation_error", lambda value: value[-1]),
-                tested("validation, mean", "rotation_mean"),
-                tested("validation, median", "rotation_median"),
-            ],
-        ),
-        (
-            "Translation error",
-            "radii",
-            [
-                of("training", "translation_error", lambda value: value[-1]),
-                tested("validation", "translation_mean"),
-            ],
-        ),
-        ("Recall at 5° and 0.1", "", [tested("validation", "recall_5deg_0.1")]),
-        ("Learning rate", "", [of("rate", "learning_rate")]),
-        ("Speed", "steps/s", [of("speed", "steps_per_second")]),
-        *(
-            (
-                title,
-                "",
-                [of(f"iteration {i + 1}", name, lambda value, i=i: value[i]) for i in iterations],
-            )
-            for name, title in _ANNEALING.items()
-        ),
-    ]
-
-
-def _figure(title: str, unit: str, curves: Sequence[Curve]) -> str:
-    steps = [step for _, known, _ in curves for step in known]
-    values = [value for _, _, known in curves for value in known if _finite(value)]
+def _figure(chart: Chart) -> str:
+    steps = [step for curve in chart.curves for step in curve.steps]
+    values = [value for curve in chart.curves for value in curve.values if _finite(value)]
     low, high = (min(values), max(values)) if values else (0.0, 1.0)
     if low == high:
         low, high = low - 0.5, high + 0.5
@@ -133,13 +70,15 @@ def _figure(title: str, unit: str, curves: Sequence[Curve]) -> str:
         return f"{x:.1f},{y:.1f}"
 
     drawn, legend = [], []
-    for (name, known, found), color in zip(curves, itertools.cycle(_COLORS), strict=False):
+    for curve, color in zip(chart.curves, itertools.cycle(_COLORS), strict=False):
         points = " ".join(
-            place(step, value) for step, value in zip(known, found, strict=True) if _finite(value)
+            place(step, value)
+            for step, value in zip(curve.steps, curve.values, strict=True)
+            if _finite(value)
         )
         drawn.append(f'<polyline points="{points}" fill="none" stroke="{color}" stroke-width="2"/>')
-        if len(curves) > 1:
-            legend.append(f'<span style="color:{color}">{html.escape(name)}</span>')
+        if len(chart.curves) > 1:
+            legend.append(f'<span style="color:{color}">{html.escape(curve.name)}</span>')
     labels = "".join(
         f'<text x="{x}" y="{y}" font-size="11" text-anchor="{anchor}" fill="#5a6472">{text}</text>'
         for x, y, anchor, text in (
@@ -149,7 +88,7 @@ def _figure(title: str, unit: str, curves: Sequence[Curve]) -> str:
             (_WIDTH - 10, _HEIGHT - 8, "end", f"{last}"),
         )
     )
-    caption = html.escape(f"{title} ({unit})" if unit else title)
+    caption = html.escape(f"{chart.title} ({chart.unit})" if chart.unit else chart.title)
     return (
         f'<figure><figcaption>{caption}</figcaption><svg width="{_WIDTH}" height="{_HEIGHT}" '
         f'role="img" aria-label="{caption}">{"".join(drawn)}{labels}</svg>'

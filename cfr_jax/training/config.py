@@ -1,0 +1,197 @@
+"""What a training is told: every field with its default, and its unit or its reason.
+
+The defaults are the recipe for the open CAD corpus; a file in `configs/` states what differs.
+`train.py` sets fields by flags (`--config.train.peak_rate=3e-4`), one after the other and by the
+types written here; `checked` then looks at the whole.
+"""
+
+# No `from __future__ import annotations`: ml_collections reads the types of the fields.
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+from cfr_jax.data.augment import Sampling
+from cfr_jax.runtime.fields import check_types
+from cfr_jax.training.step import PRECISIONS
+
+Range = tuple[float, float]
+
+
+@dataclass(slots=True)
+class DataSection:
+    """Where pairs come from: a corpus file in the layout of ModelNet40, or sources by name.
+
+    `{"street": {"kind": "kitti", "path": ..., "repeat": 4}, ...}`: `training.sources` explains the
+    kinds, and checks the settings of each.
+    """
+
+    # `object`, which flags read as a path or as a Python literal
+    train: object = "data/open_cad/train.h5"  # `cfr data open-cad --out data/open_cad` makes it
+    validation: object = "data/open_cad/val.h5"
+
+    def __post_init__(self):
+        for each in dataclasses.fields(self):
+            given = getattr(self, each.name)
+            if not isinstance(given, str | dict):
+                raise ValueError(
+                    f"data.{each.name}: got {given!r}, wanted a path, or sources by name"
+                )
+
+
+@dataclass(slots=True)
+class SamplingSection:
+    """How training pairs are drawn: fields of `data.augment.Sampling`, which explains and checks
+    them."""
+
+    keep: Range = (0.55, 0.85)  # share left by each crop; the test protocol has 0.7
+    angle: float = Sampling.angle  # degrees, per Euler angle
+    translation: float = Sampling.translation
+    both_ways: float = 0.5  # of the pairs: each angle from [-angle, angle], not [0, angle]
+    near: float = 0.3  # of the pairs: smaller motions, as a second cascade sees them
+    centered: float = 0.4  # of the pairs: clouds about their own centroids, as `align` has them
+    any_orientation: float = 0.3  # of the shapes; the rest stand upright, as CAD models do
+    scale: Range = (0.8, 1.2)
+    uneven: float = 0.0  # of the pairs: clouds denser on one side, `density` times
+    density: Range = Sampling.density
+    outliers: Range = Sampling.outliers  # share of the points
+    noise: Range = Sampling.noise  # per axis
+    sensor_noise: float = 0.0  # of the pairs: along the rays of a depth sensor instead
+    sensor_scale: Range = Sampling.sensor_scale  # standard deviation at the middle of the cloud
+    estimated_normals: float = 0.4  # of the pairs; users' clouds mostly have no exact ones
+
+    def __post_init__(self):
+        check_types(self, "sampling.")
+
+
+@dataclass(slots=True)
+class Phase:
+    """A stretch of the curriculum."""
+
+    steps: int
+    points: int  # of each cloud
+    neighbors: int  # of each point
+    batch: int  # pairs of a step, of all devices together
+    sampling: dict[str, Any] = field(default_factory=dict)
+    """Fields of `SamplingSection` that differ in this phase."""
+
+    def __post_init__(self):
+        check_types(self, "phases: ")
+        if self.steps < 0 or self.batch < 1:
+            raise ValueError(
+                f"phases: got {self.steps} steps of {self.batch} pairs, wanted 0 or more steps of "
+                "at least 1 pair"
+            )
+        known = [each.name for each in dataclasses.fields(SamplingSection)]
+        if unknown := sorted(self.sampling.keys() - known):
+            raise ValueError(
+                f"phases: sampling: got {', '.join(unknown)}, wanted some of {', '.join(known)}"
+            )
+
+
+@dataclass(slots=True)
+class TrainSection:
+    """Loss, optimizer, and how a step is computed."""
+
+    optimizer: str = "adamw"  # one of `optimizers.OPTIMIZERS`
+    schedule: str = "cosine"  # one of `optimizers.SCHEDULES`
+    peak_rate: float = 1e-3
+    warmup: float = 0.1  # share of all steps
+    cooldown: float = 0.2  # the same; only "wsd" has one
+    clip: float = 1.0  # norm of the whole gradient
+    weight_decay: float = 1e-5
+    correspondence_weight: float = 0.05  # of that loss beside the motion's
+    average_decay: float = 0.999  # of the average of the weights, which is validated and kept
+    precision: str = "float32"  # of the MLPs' products, on accelerators: one of `step.PRECISIONS`
+    pairs_at_once: int = 1  # on an accelerator: as many as fit; their gradients are summed
+    max_skipped: int = 20  # steps in a row whose gradient is not finite, before it stops
+    workers: int = 1  # threads that make pairs
+    start_from: str = ""  # weights to go on from, by name or path, instead of random ones
+
+    def __post_init__(self):
+        check_types(self, "train.")
+        _check_least(self, 1, "workers")
+        _check_least(self, 0, "max_skipped")
+        if self.precision not in PRECISIONS:
+            raise ValueError(
+                f"precision: got {self.precision!r}, wanted one of {', '.join(PRECISIONS)}"
+            )
+
+
+@dataclass(slots=True)
+class TrainingConfig:
+    """All that `train.py` reads. A section may be given as a dict of its fields."""
+
+    seed: int = 0
+    network: str = "cfr"  # or "rpmnet"
+    iterations: int = 5
+    shared: bool = False  # one light layer for all iterations, instead of one each
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Settings of the network other than its usual ones: of `networks.inputs.Settings` for CFR."""
+    data: DataSection = field(default_factory=DataSection)
+    # Clouds grow as training goes on: small ones learn the most per second at first, and the
+    # weights depend neither on the points nor on the neighbors (docs/training.md).
+    phases: tuple[Phase, ...] = field(
+        default_factory=lambda: (
+            Phase(steps=3000, points=256, neighbors=24, batch=8),
+            Phase(steps=4000, points=717, neighbors=32, batch=8),
+        )
+    )
+    sampling: SamplingSection = field(default_factory=SamplingSection)
+    train: TrainSection = field(default_factory=TrainSection)
+    log_every: int = 50  # steps
+    checkpoint_every: int = 250  # steps
+    validate_every: int = 500  # steps
+    # all of val.h5: on 96, two flipped shapes decided which weights were best
+    validation_pairs: int = 465
+    keep_checkpoints: int = 2  # the last ones; the best is kept beside them
+
+    def __post_init__(self):
+        # made once more, sections are checked with what flags have set since
+        self.data = _made(DataSection, self.data, "data")
+        self.sampling = _made(SamplingSection, self.sampling, "sampling")
+        self.train = _made(TrainSection, self.train, "train")
+        if isinstance(self.phases, tuple):
+            self.phases = tuple(_made(Phase, phase, "phases") for phase in self.phases)
+        check_types(self)
+        _check_least(self, 1, "log_every", "checkpoint_every", "validate_every")
+        _check_least(self, 1, "validation_pairs", "keep_checkpoints")
+        for phase in self.phases:
+            self.sampling_of(phase, Sampling.radius)
+
+    def sampling_of(self, phase: Phase, radius: float) -> Sampling:
+        """How pairs of a phase are drawn, their neighbors within the network's `radius`.
+
+        Raises ValueError, naming the field, where that cannot be.
+        """
+        given = dataclasses.asdict(self.sampling) | phase.sampling
+        return Sampling(points=phase.points, neighbors=phase.neighbors, radius=radius, **given)
+
+
+def checked(config: object) -> TrainingConfig:
+    """A copy of a config, every value of which was checked.
+
+    Raises ValueError, naming the field, for a value that cannot be used.
+    """
+    if not isinstance(config, TrainingConfig):
+        raise ValueError(
+            f"config: got {type(config).__name__}, wanted TrainingConfig "
+            "(cfr_jax/training/config.py; configs/ has examples)"
+        )
+    return dataclasses.replace(config)
+
+
+def _made(kind: Any, given: Any, name: str) -> Any:
+    if isinstance(given, kind):
+        return dataclasses.replace(given)
+    if not isinstance(given, dict):
+        raise ValueError(f"{name}: got {given!r}, wanted {kind.__name__} or a dict of its fields")
+    try:
+        return kind(**given)
+    except TypeError as error:  # names the field that is unknown or missing
+        raise ValueError(f"{name}: {error}") from error
+
+
+def _check_least(section: Any, least: int, *names: str) -> None:
+    for name in names:
+        if getattr(section, name) < least:
+            raise ValueError(f"{name}: got {getattr(section, name)}, wanted at least {least}")
