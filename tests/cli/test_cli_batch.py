@@ -18,8 +18,8 @@ import pytest
 from cfr_jax.batch import records, stream
 from cfr_jax.cli import main
 
-TESTS = Path(__file__).parent
-SCHEMA = json.loads((TESTS.parents[1] / "cfr_jax/cli/schemas/batch.schema.json").read_text())
+TESTS = Path(__file__).parents[1]
+SCHEMA = json.loads((TESTS.parent / "cfr_jax/cli/schemas/batch.schema.json").read_text())
 
 
 @pytest.fixture(autouse=True)
