@@ -40,7 +40,13 @@ class Shapes:
     @classmethod
     def of(cls, corpus: Corpus) -> Shapes:
         """The shapes of a corpus, still in host memory. Rounds coordinates to 2^-12 within the unit
-        sphere, and normals by 0.3 degrees."""
+        sphere, and normals by 0.3 degrees. Raises ValueError where a coordinate is too large.
+        """
+        most = float(np.abs(corpus.points).max())
+        if most > np.finfo(np.float16).max:
+            raise ValueError(
+                f"corpus: got a coordinate of {most:g}, wanted shapes in the unit sphere"
+            )
         normals = np.rint(_BYTE * corpus.normals).astype(np.int8)
         return cls(corpus.points.astype(np.float16), normals)
 

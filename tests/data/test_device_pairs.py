@@ -1,6 +1,7 @@
 """Pairs drawn on the device have the distributions of those drawn on the host."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -216,3 +217,25 @@ def test_a_shape_without_normals_keeps_none(corpus):
     pairs = on_device(bare, PLAIN, count=2)
 
     assert not pairs["source_normals"].any()
+
+
+def test_shapes_far_from_the_unit_sphere_are_refused(corpus):
+    far = Corpus(corpus.points * 1e6, corpus.normals, corpus.labels, corpus.names, ("ellipsoid",))
+
+    with pytest.raises(ValueError, match="corpus: got a coordinate of .*e.05, wanted shapes in"):
+        Shapes.of(far)
+
+
+@pytest.mark.parametrize("platform", ["cuda", "tpu"])
+def test_the_drawing_lowers_for_accelerators(corpus, platform):
+    shapes = jax.tree.map(jnp.asarray, Shapes.of(corpus))
+    items, positions = jnp.zeros(4, jnp.int32), jnp.zeros(4, jnp.uint32)
+
+    traced = drawn_pairs.trace(shapes, jnp.uint32(0), items, positions, ALL)
+    text = traced.lower(lowering_platforms=(platform,)).as_text()
+
+    called = set(re.findall(r"custom_call @([\w.$]+)", text))
+    assert not {name for name in called if re.search("lapack|callback|cpu", name)}
+    # positions and motions at full precision: every product says so
+    products = [line for line in text.splitlines() if "stablehlo.dot_general" in line]
+    assert products and all(line.count("HIGHEST") == 2 for line in products)

@@ -159,6 +159,19 @@ def shapes_in(line):
     ]
 
 
+@pytest.mark.parametrize("platform", ["cuda", "tpu"])
+def test_its_gradient_lowers_for_accelerators(layers, raw, platform):
+    def loss(layers, raw):
+        return jnp.sum(pooled_features(layers, raw, groups=GROUPS, activations="bfloat16"))
+
+    traced = jax.jit(jax.grad(loss)).trace(layers, raw)
+    text = traced.lower(lowering_platforms=(platform,)).as_text()
+
+    products = [line for line in text.splitlines() if "stablehlo.dot_general" in line]
+    rows = [line for line in products if f"{N * K}x" in line or f"{N}x{K}x" in line]
+    assert len(rows) >= 8 and all("xbf16>" in line for line in rows)
+
+
 def test_another_kind_of_number_is_refused(layers, raw, unchecked):
     with pytest.raises(ValueError, match="activations: got 'float16', wanted 'float32' or"):
         pooled_features(layers, raw, groups=GROUPS, activations="float16")
