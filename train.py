@@ -4,6 +4,7 @@ A config is a Python file that says what differs from the defaults. Those in con
 
     open_cad.py    the open CAD corpus, about two hours on two cores: the defaults
     object.py      the same at length: the weights `object`
+    object_gpu.py  `object` gone on with on GPUs, for some minutes
     scans.py       fine-tuning on real scans: the weights `scan`
     own_scans.py   scans of your own (docs/train-on-your-data.md)
 

@@ -28,6 +28,7 @@ def pytest_sessionstart():
     # The fields of a result state the shapes of one pair. Coming out of vmap or a scan it is made
     # anew, with one more axis in front or with placeholders, and that is no mistake.
     from cfr_jax.alignment import case, confidence, quality, solving
+    from cfr_jax.data.device_pairs import Shapes
     from cfr_jax.networks import sinkhorn
     from cfr_jax.networks.cfr import registration
     from cfr_jax.networks.clues import NetworkClues
@@ -45,6 +46,7 @@ def pytest_sessionstart():
         solving.DeviceCloud,
         case.Found,
         losses.PairLoss,
+        Shapes,
         TrainState,
     ):
         typing.no_type_check(kind.__init__)

@@ -27,7 +27,7 @@ _SHARES = (
     "estimated_normals",
 )
 _RANGES = ("keep", "scale", "density", "outliers", "noise", "sensor_scale")
-_SENSOR_AWAY = (2.0, 4.0)  # of a sensor from the middle of what it sees
+SENSOR_AWAY = (2.0, 4.0)  # of a sensor from the middle of what it sees
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def add_sensor_noise(
     """Along the rays of a depth sensor somewhere around the cloud, which measures disparity: its
     error grows with the square of the distance (Khoshelham & Elberink, 2012)."""
     middle = points.mean(axis=0)
-    away = rng.uniform(*_SENSOR_AWAY)
+    away = rng.uniform(*SENSOR_AWAY)
     ray = points - (middle + away * _direction(rng))
     distance = np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-6)
     scale = rng.uniform(*sampling.sensor_scale) * (distance / away) ** 2

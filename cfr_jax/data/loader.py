@@ -7,12 +7,14 @@ pairs, and a run that resumes at a position goes on with the pair that it would 
 from __future__ import annotations
 
 import collections
+import functools
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Int
 
 from cfr_jax.data.augment import Sampling, View, choose_rows, finish_pair
 from cfr_jax.data.corpus import Corpus
@@ -78,12 +80,26 @@ class Mixture:
 def batch_at(source: Source, position: int, size: int, sampling: Sampling, seed: int) -> dict:
     """The `size` pairs from `position` on of the endless shuffled stream; arrays (size, ...)."""
     pairs = []
-    for number in range(position, position + size):
-        epoch, place = divmod(number, len(source))
-        order = np.random.default_rng((seed, epoch)).permutation(len(source))
-        rng = np.random.default_rng((seed, epoch, place))
-        pairs.append(source.draw(int(order[place]), sampling, rng))
+    for number, item in zip(
+        range(position, position + size), items_at(len(source), position, size, seed), strict=True
+    ):
+        rng = np.random.default_rng((seed, *divmod(number, len(source))))
+        pairs.append(source.draw(int(item), sampling, rng))
     return {key: np.stack([pair[key] for pair in pairs]) for key in pairs[0]}
+
+
+def items_at(count: int, position: int, size: int, seed: int) -> Int[np.ndarray, " size"]:
+    """The items of `size` pairs from `position` on: each of `count` once an epoch, in an order that
+    belongs to seed and epoch."""
+    epochs, places = np.divmod(np.arange(position, position + size), count)
+    return np.array(
+        [_order(count, seed, epoch)[place] for epoch, place in zip(epochs, places, strict=True)]
+    )
+
+
+@functools.lru_cache(4)
+def _order(count, seed, epoch):
+    return np.random.default_rng((seed, epoch)).permutation(count)
 
 
 def batches(

@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -69,10 +70,18 @@ class Checkpoints:
         """The steps that there are checkpoints of, damaged or not, oldest first."""
         return sorted(int(path.name) for path in self.folder.iterdir() if path.name.isdigit())
 
-    def save(self, state: TrainState, about: dict, best: int | None = None) -> None:
-        """Saves in the background; `about` is anything JSON holds, `best` the step to keep.
+    def save(
+        self,
+        state: TrainState,
+        about: dict,
+        best: int | None = None,
+        then: Callable[[TrainState], None] | None = None,
+    ) -> None:
+        """Saves in the background; `about` is anything JSON holds, `best` the step to keep. Once
+        the checkpoint is there, the first process calls `then` with what was saved.
 
-        Waits for the save before. Raises `SaveError` where that could not be written.
+        Waits for the save before. Raises `SaveError` where that could not be written, and what
+        `then` raised.
         """
         self.wait()
         step = int(state.step)
@@ -85,6 +94,8 @@ class Checkpoints:
         except (OSError, ValueError) as error:
             self._fail(step, error)
         self._running = self._thread.submit(self._finish, step, beside, about, best)
+        if then is not None:
+            self._running = self._thread.submit(_after, self._running, then, copy)
 
     def wait(self) -> None:
         """Waits until what was saved is there; raises `SaveError` where it could not be written."""
@@ -161,3 +172,9 @@ class Checkpoints:
             f"checkpoint of step {step} in {self.folder} could not be written; {kept}.\n"
             f"Make room or give another --workdir, then run the same command again ({why[:300]})"
         ) from error
+
+
+def _after(saved: Future, then: Callable[[TrainState], None], state: TrainState) -> None:
+    saved.result()
+    if is_first():
+        then(state)

@@ -15,6 +15,7 @@ from cfr_jax.runtime.fields import check_types
 from cfr_jax.training.step import PRECISIONS
 
 Range = tuple[float, float]
+PLACES = ("host", "device")
 
 
 @dataclass(slots=True)
@@ -93,28 +94,34 @@ class TrainSection:
     """Loss, optimizer, and how a step is computed."""
 
     optimizer: str = "adamw"  # one of `optimizers.OPTIMIZERS`
-    schedule: str = "cosine"  # one of `optimizers.SCHEDULES`
+    schedule: str = "cosine"  # one of `optimizers.SCHEDULES`, which `make_schedule` explains
     peak_rate: float = 1e-3
     warmup: float = 0.1  # share of all steps
-    cooldown: float = 0.2  # the same; only "wsd" has one
+    cooldown: float = 0.2  # the same; "wsd" and "trapezoid" have one
     clip: float = 1.0  # norm of the whole gradient
     weight_decay: float = 1e-5
     correspondence_weight: float = 0.05  # of that loss beside the motion's
     average_decay: float = 0.999  # of the average of the weights, which is validated and kept
-    precision: str = "float32"  # of the MLPs' products, on accelerators: one of `step.PRECISIONS`
+    # Of the learned layers' products: "float32"; "tensorfloat32", on a GPU; or "bfloat16", which
+    # also stores the activations of CFR's heavy extraction so. Geometry stays float32.
+    precision: str = "float32"
     pairs_at_once: int = 1  # on an accelerator: as many as fit; their gradients are summed
     max_skipped: int = 20  # steps in a row whose gradient is not finite, before it stops
-    workers: int = 1  # threads that make pairs
+    draw: str = "host"  # where pairs are drawn; those of shapes can be on the "device"
+    workers: int = 1  # threads that draw on the host
+    steps_at_once: int = 1  # in one program, where the device draws
+    minutes: float = 0.0  # of the wall clock, instead of the only phase's steps; 0: those steps
     start_from: str = ""  # weights to go on from, by name or path, instead of random ones
 
     def __post_init__(self):
         check_types(self, "train.")
-        _check_least(self, 1, "workers")
-        _check_least(self, 0, "max_skipped")
-        if self.precision not in PRECISIONS:
-            raise ValueError(
-                f"precision: got {self.precision!r}, wanted one of {', '.join(PRECISIONS)}"
-            )
+        _check_least(self, 1, "workers", "steps_at_once")
+        _check_least(self, 0, "max_skipped", "minutes")
+        for name, known in (("precision", PRECISIONS), ("draw", PLACES)):
+            if getattr(self, name) not in known:
+                raise ValueError(
+                    f"{name}: got {getattr(self, name)!r}, wanted one of {', '.join(known)}"
+                )
 
 
 @dataclass(slots=True)
@@ -157,6 +164,7 @@ class TrainingConfig:
         _check_least(self, 1, "validation_pairs", "keep_checkpoints")
         for phase in self.phases:
             self.sampling_of(phase, Sampling.radius)
+        _check_length(self.train, self.phases)
 
     def sampling_of(self, phase: Phase, radius: float) -> Sampling:
         """How pairs of a phase are drawn, their neighbors within the network's `radius`.
@@ -178,6 +186,27 @@ def checked(config: object) -> TrainingConfig:
             "(cfr_jax/training/config.py; configs/ has examples)"
         )
     return dataclasses.replace(config)
+
+
+def _check_length(train: TrainSection, phases: tuple[Phase, ...]) -> None:
+    if train.draw == "host" and (train.steps_at_once > 1 or train.minutes):
+        raise ValueError(
+            f"steps_at_once, minutes: got {train.steps_at_once} and {train.minutes}, wanted 1 and "
+            '0 where train.draw is "host": each batch comes by itself'
+        )
+    if train.minutes and (len(phases) > 1 or train.schedule != "trapezoid"):
+        raise ValueError(
+            f"minutes: got {train.minutes} for {len(phases)} phases and schedule "
+            f"{train.schedule!r}, wanted one phase, whose steps then follow, and 'trapezoid'"
+        )
+    if train.minutes:
+        return
+    for phase in phases:
+        if phase.steps % train.steps_at_once:
+            raise ValueError(
+                f"steps_at_once: got {train.steps_at_once}, wanted a divisor of the {phase.steps} "
+                "steps of a phase: the rest would be compiled anew"
+            )
 
 
 def _made(kind: Any, given: Any, name: str) -> Any:

@@ -88,6 +88,11 @@ def spread(batch: dict, mesh: Mesh) -> dict:
     return {key: jax.make_array_from_process_local_data(rows, batch[key]) for key in batch}
 
 
+def spread_steps(rows: np.ndarray, mesh: Mesh) -> jax.Array:
+    """Rows (k, b, ...) of k batches over the devices, each process giving its share of the b."""
+    return jax.make_array_from_process_local_data(NamedSharding(mesh, P(None, AXIS)), rows)
+
+
 def gather(values: jax.Array) -> np.ndarray:
     """All rows of an array that lies spread over the devices, in every process."""
     return np.asarray(multihost_utils.process_allgather(values, tiled=True))

@@ -20,7 +20,7 @@ from cfr_jax.weights import files as weights
 
 _NAMED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 WEIGHTS = "weights.safetensors"  # the best so far
-_KEPT = ("step", "best", "validation", "position", "clock", "skipped")
+_KEPT = ("step", "steps", "best", "validation", "position", "clock", "skipped")
 
 
 def begin(config: TrainingConfig, stamps: dict[str, str]) -> dict:
@@ -29,6 +29,7 @@ def begin(config: TrainingConfig, stamps: dict[str, str]) -> dict:
     versions |= {"cfr_jax": __version__, "python": platform.python_version()}
     return {
         "step": 0,
+        "steps": None,  # of the whole training, where train.minutes decided
         "best": {},
         "validation": {},  # the last one
         "position": 0,  # pairs of the stream that were used; with the seed it decides all others
@@ -56,7 +57,7 @@ def go_on(before: dict, now: dict, total: int, workdir: Path) -> list[str]:
             f"now {now['data']['data.train']}); wanted another --workdir. To begin there with the "
             f"weights of this one: --config.train.start_from={workdir / WEIGHTS}"
         )
-    now |= {key: before[key] for key in _KEPT}
+    now |= {key: before[key] for key in _KEPT if key in before}
     done = now["step"]
     changed = list(_changes(before["config"], now["config"]))
     told = [f"going on from step {done}"] if done < total else []
@@ -70,11 +71,11 @@ def go_on(before: dict, now: dict, total: int, workdir: Path) -> list[str]:
     return told
 
 
-def notes(config: TrainingConfig, about: dict) -> dict[str, str]:
+def notes(config: TrainingConfig, best: dict) -> dict[str, str]:
     """What a weights file says of its own making."""
     return {
         "config": json.dumps(dataclasses.asdict(config), sort_keys=True),
-        "validation": json.dumps(about["best"]),
+        "validation": json.dumps(best),
         "made_by": f"cfr_jax {__version__} train.py",
     }
 

@@ -36,15 +36,20 @@ def learner(config: TrainingConfig) -> Learner:
     if config.network == "cfr":
         changed = config.settings
         _check_settings(changed)
+        of_training = {"detach_motion": True, **changed}
+        if config.train.precision == "bfloat16":
+            of_training["activations"] = "bfloat16"
         return Learner(
             fresh=lambda key: network.init_params(key, config.iterations, config.shared),
             unroll=iterations.unroll,
-            trained=lambda count: inputs.Settings(neighbors=count, detach_motion=True, **changed),
+            trained=lambda count: inputs.Settings(neighbors=count, **of_training),
             validated=inputs.Settings(**changed),
         )
     if config.network == "rpmnet":
         if changed := config.settings:
             raise ValueError(f"settings: got {', '.join(changed)}, wanted none for rpmnet")
+        if config.train.precision == "bfloat16":
+            raise ValueError("precision: got 'bfloat16', which rpmnet does not have")
         return Learner(
             fresh=rpmnet.init_params,
             unroll=rpmnet.unroll,
@@ -58,7 +63,8 @@ def learner(config: TrainingConfig) -> Learner:
 
 def _check_settings(changed: dict[str, Any]) -> None:
     allowed = {field.name for field in dataclasses.fields(inputs.Settings)}
-    allowed -= {"neighbors", "detach_motion"}  # those of the phases, and of all training
+    # those of the phases, of all training, and of its precision
+    allowed -= {"neighbors", "detach_motion", "activations"}
     if unknown := changed.keys() - allowed:
         raise ValueError(
             f"settings: got {', '.join(sorted(unknown))}, wanted some of "

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import time
 from pathlib import Path
 
 import numpy as np
 
-from cfr_jax.data.loader import batches
-from cfr_jax.training import devices, identity, step, stopping, validation
+from cfr_jax.training import devices, identity, optimizers, step, stopping, validation
 from cfr_jax.training.checkpoints import Checkpoints
 from cfr_jax.training.config import Phase, TrainingConfig
+from cfr_jax.training.drawing import Drawing, Leg, make_drawing
+from cfr_jax.training.drawing.device import DeviceDrawing
 from cfr_jax.training.learner import remaining
 from cfr_jax.training.reporting.reporter import Reporter
 from cfr_jax.training.step import TrainState
 from cfr_jax.training.task import Task, fresh_params, prepare
 from cfr_jax.weights import files as weights
+
+_TRAINED = 0.97  # of the time left; the rest is for validations and checkpoints
 
 
 def run(config: TrainingConfig, workdir: Path) -> dict:
@@ -30,6 +35,7 @@ def run(config: TrainingConfig, workdir: Path) -> dict:
     or answers stay infinite, OSError where nothing can be written, and `Stopped` after SIGINT or
     SIGTERM, once all is saved.
     """
+    began = time.monotonic()
     if workdir.exists() and not workdir.is_dir():
         raise ValueError(f"workdir: {workdir} is a file, wanted a folder")
     workdir.mkdir(parents=True, exist_ok=True)
@@ -42,11 +48,17 @@ def run(config: TrainingConfig, workdir: Path) -> dict:
         restored = checkpoints.restore(state)
         if restored is not None:
             state, before = restored
+            if config.train.minutes and before.get("steps"):  # they were decided then
+                task = task.planned(before["steps"])
             told += identity.go_on(before, about, task.steps, workdir)
+        drawing = make_drawing(config, task.mixture, task.mesh)
         with Reporter(workdir, task, about) as reports:
             for line in told:
                 reports.say(line)
-            _Training(config, workdir, task, state, about, checkpoints, reports).go_to_the_end()
+            training = _Training(
+                config, workdir, task, state, about, checkpoints, reports, drawing, began
+            )
+            training.go_to_the_end()
     return about["best"]
 
 
@@ -61,14 +73,27 @@ class _Training:
     about: dict
     checkpoints: Checkpoints
     reports: Reporter
+    drawing: Drawing
+    began: float
+    """When the command was given, by `time.monotonic`."""
 
     def __post_init__(self):
-        self._placed = validation.place(self.task.pairs, self.task.mesh)
+        self._placed = validation.place(
+            self.task.pairs, self.task.mesh, self.config.train.pairs_at_once
+        )
 
     def go_to_the_end(self) -> None:
+        unplanned = self.config.train.minutes and not self.about["steps"]
+        left = [phase for phase, _ in remaining(self.task.phases, self.about["step"])]
+        for phase in (self.task.phases if unplanned else left)[:1]:
+            self.drawing.begin(self._leg(phase), self.state)  # while the weights are validated
         if self.config.train.start_from and self.about["step"] == 0:
             self._validate()
         self._keep_best()  # a kill may have come between a checkpoint and its weights
+        if unplanned:
+            self._plan()
+        steps = devices.replicate(np.int32(self.task.steps), self.task.mesh)
+        self.state = self.state.replace(optimizer=optimizers.planned(self.state.optimizer, steps))
         with stopping.stop_requests() as requests:
             for phase, ran in remaining(self.task.phases, self.about["step"]):
                 self._go_through(phase, ran, requests)
@@ -79,39 +104,22 @@ class _Training:
 
     def _go_through(self, phase: Phase, ran: int, requests: stopping.Requests) -> None:
         config, task, about = self.config, self.task, self.about
-        recipe = step.Recipe(
-            unroll=task.learner.unroll,
-            settings=task.learner.trained(phase.neighbors),
-            optimizer=task.optimizer,
-            mesh=task.mesh,
-            correspondence_weight=config.train.correspondence_weight,
-            average_decay=config.train.average_decay,
-            pairs_at_once=config.train.pairs_at_once,
-            precision=config.train.precision,
-            max_skipped=config.train.max_skipped,
-        )
-        stream = batches(
-            task.mixture,
-            task.samplings[task.phases.index(phase)],
-            size=phase.batch,
-            position=about["position"],
-            count=phase.steps - ran,
-            seed=config.seed,
-            workers=config.train.workers,
-            share=devices.share_of(phase.batch),
-        )
+        leg = self._leg(phase)
+        self.drawing.begin(leg, self.state)
         self.reports.begin(phase)
-        for batch in stream:
-            self.state, measured = step.train_step(
-                self.state, devices.spread(batch, task.mesh), recipe=recipe
-            )
-            done = about["step"] = about["step"] + 1
-            about["position"] += phase.batch
-            self.reports.step(done, measured)
+        for steps, advance in self.drawing.stretches(leg, self.state, ran, about["position"]):
+            self.state, measured = advance(self.state)
+            before, done = about["step"], about["step"] + steps
+            about["step"] = done
+            about["position"] += steps * phase.batch
+            self.reports.step(done, measured, steps)
             last, asked = done == task.steps, requests.received
-            logging = last or done % config.log_every == 0
-            validating = last or done % config.validate_every == 0
-            saving = validating or done % config.checkpoint_every == 0 or asked
+
+            def due(every, before=before, done=done, last=last):
+                return last or before // every < done // every
+
+            logging, validating = due(config.log_every), due(config.validate_every)
+            saving = validating or due(config.checkpoint_every) or asked
             if logging:
                 self.reports.measured(done, int(self.state.skipped))
             if logging or saving:
@@ -120,9 +128,10 @@ class _Training:
                 self._validate()
             if saving:
                 self._take_note()
-                self.checkpoints.save(self.state, about.copy(), best=about["best"].get("step"))
-            if validating:
-                self._keep_best()
+                best, then = about["best"], None
+                if validating and best["step"] == done:
+                    then = functools.partial(self._write_best, best)
+                self.checkpoints.save(self.state, about.copy(), best=best.get("step"), then=then)
             if asked:
                 self.checkpoints.wait()
                 raise stopping.Stopped(
@@ -135,7 +144,12 @@ class _Training:
         task, about = self.task, self.about
         self.reports.pause()
         found = validation.validate(
-            task.learner, self.state.average, self._placed, task.pairs["transform"], task.mesh
+            task.learner,
+            self.state.average,
+            self._placed,
+            task.pairs["transform"],
+            task.mesh,
+            self.config.train.pairs_at_once,
         )
         self.reports.validated(about["step"], found)
         del found["transforms"]
@@ -145,16 +159,51 @@ class _Training:
         self.reports.resume()
 
     def _keep_best(self) -> None:
-        """Writes the weights where they are the best so far and not yet in their file, after the
-        checkpoint that says so."""
-        if self.about["best"].get("step") != self.about["step"]:
-            return
-        self.reports.pause()
-        self.checkpoints.wait()
-        file, notes = self.workdir / identity.WEIGHTS, identity.notes(self.config, self.about)
-        if devices.is_first() and not identity.holds(file, self.about["best"]):
-            weights.save_params(file, self.state.average, notes)
-        self.reports.resume()
+        """Writes the weights where they are the best so far and not yet in their file."""
+        if self.about["best"].get("step") == self.about["step"] and devices.is_first():
+            self._write_best(self.about["best"], self.state)
+
+    def _write_best(self, best: dict, state: TrainState) -> None:
+        """The weights of a state whose validation is `best`. In the middle of a training this is
+        done beside it, once the checkpoint is there that calls them so."""
+        file = self.workdir / identity.WEIGHTS
+        if not identity.holds(file, best):
+            weights.save_params(file, state.average, identity.notes(self.config, best))
+
+    def _plan(self) -> None:
+        """As many steps as fit into `train.minutes`, by the speed that they have here."""
+        assert isinstance(self.drawing, DeviceDrawing)  # `task.prepare` saw to that
+        (phase,), at_once = self.task.phases, self.config.train.steps_at_once
+        speed = self.drawing.speed(self._leg(phase), self.state)
+        spent = time.monotonic() - self.began
+        left = 60 * self.config.train.minutes - spent
+        steps = devices.agree(max(0, int(_TRAINED * left * speed)) // at_once * at_once)
+        if not steps:
+            raise ValueError(
+                f"minutes: got {self.config.train.minutes}, wanted more: opening and compiling "
+                f"took {spent:.0f} seconds, and {at_once} steps take {at_once / speed:.1f}"
+            )
+        self.about["steps"], self.task = steps, self.task.planned(steps)
+        self.reports.plan(self.task)
+        self.reports.say(
+            f"{speed:.1f} steps/s, {speed * phase.batch:.0f} pairs/s: {steps} steps in the "
+            f"{left:.0f} s left"
+        )
+
+    def _leg(self, phase: Phase) -> Leg:
+        config, task = self.config, self.task
+        recipe = step.Recipe(
+            unroll=task.learner.unroll,
+            settings=task.learner.trained(phase.neighbors),
+            optimizer=task.optimizer,
+            mesh=task.mesh,
+            correspondence_weight=config.train.correspondence_weight,
+            average_decay=config.train.average_decay,
+            pairs_at_once=config.train.pairs_at_once,
+            precision=config.train.precision,
+            max_skipped=config.train.max_skipped,
+        )
+        return Leg(phase, task.samplings[task.phases.index(phase)], recipe)
 
     def _take_note(self) -> None:
         self.about |= {"clock": self.reports.clock.read(), "skipped": int(self.state.skipped)}

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import NamedTuple
+
 import jax
+import jax.numpy as jnp
 import optax
 import optax.contrib
+from jax.typing import ArrayLike
+from jaxtyping import Array, Int
 
-SCHEDULES = ("cosine", "wsd", "constant")
+SCHEDULES = ("cosine", "wsd", "constant", "trapezoid")
 OPTIMIZERS = ("adamw", "adam", "lion", "sgd", "muon")
 
 # Smaller sides of the matrices that "muon" turns: below, they are a network's inputs and outputs;
@@ -14,15 +20,56 @@ OPTIMIZERS = ("adamw", "adam", "lion", "sgd", "muon")
 _HIDDEN = range(32, 129)
 
 
+@dataclasses.dataclass(frozen=True)
+class Trapezoid:
+    """A rate that rises from zero over the warm-up, stays, and falls to zero over the cooldown, in
+    straight lines; both are shares of all steps.
+
+    The number of steps is no part of the compiled program: an optimizer made with this keeps it in
+    its state (`planned`), so it may be decided once the speed of a step is known.
+    """
+
+    peak_rate: float
+    steps: int
+    warmup: float
+    cooldown: float
+
+    def __call__(self, count: ArrayLike) -> Array:
+        """The rate of step `count`, from 0."""
+        return self.at(count, self.steps)
+
+    def at(self, count: ArrayLike, steps: ArrayLike) -> Array:
+        """The same in a training of so many steps."""
+        done, steps = jnp.asarray(count, jnp.float32), jnp.asarray(steps, jnp.float32)
+        risen = (done + 1) / jnp.maximum(self.warmup * steps, 1)
+        left = (steps - done) / jnp.maximum(self.cooldown * steps, 1)
+        return self.peak_rate * jnp.clip(jnp.minimum(risen, left), 0, 1)
+
+
+class Planned(NamedTuple):
+    """Where in a training of how many steps an optimizer is."""
+
+    count: Int[Array, ""]
+    planned_steps: Int[Array, ""]
+
+
+def planned(state: optax.OptState, steps: Int[Array, ""]) -> optax.OptState:
+    """An optimizer's state in a training of `steps` steps; the same where its schedule is not a
+    `Trapezoid`."""
+    if optax.tree.get(state, "planned_steps") is None:
+        return state
+    return optax.tree.set(state, planned_steps=steps)
+
+
 def make_schedule(
     kind: str, *, peak_rate: float, steps: int, warmup: float, cooldown: float = 0.2
 ) -> optax.Schedule:
     """The learning rate over `steps` steps; `warmup` and `cooldown` are shares of them.
 
-    Every one starts at a 25th of the peak and rises over the warm-up. Then "cosine" falls to a
+    All but the last start at a 25th of the peak and rise over the warm-up. Then "cosine" falls to a
     thousandth along half a wave; "wsd" (warm-up, stable, decay) stays until the cool-down and falls
     to a thousandth in a straight line, so that a run can be made longer without starting anew;
-    "constant" stays.
+    "constant" stays. "trapezoid" is a `Trapezoid`.
     """
     if not steps > 0 or not peak_rate > 0:
         raise ValueError(f"schedule: got {steps} steps at {peak_rate}, wanted both positive")
@@ -31,6 +78,8 @@ def make_schedule(
             f"schedule: got warmup {warmup} and cooldown {cooldown}, wanted shares of all steps, "
             "together at most 1"
         )
+    if kind == "trapezoid":
+        return Trapezoid(peak_rate, steps, warmup, cooldown)
     rising = max(1, int(warmup * steps))
     start, end = peak_rate / 25, peak_rate / 1000
     if kind == "cosine":
@@ -57,6 +106,11 @@ def make_optimizer(
     momentum for the rest. "adam" adds `weight_decay` times the weights to the gradient first, as
     the published trainings did.
     """
+    if isinstance(schedule, Trapezoid):
+        return optax.chain(
+            make_optimizer(kind, _one, clip=clip, weight_decay=weight_decay),
+            _scaled_by(schedule),
+        )
     if kind == "adamw":
         rule = optax.adamw(schedule, weight_decay=weight_decay)
     elif kind == "adam":
@@ -80,6 +134,22 @@ def make_optimizer(
     else:
         raise ValueError(f"optimizer: got {kind!r}, wanted one of {', '.join(OPTIMIZERS)}")
     return optax.chain(optax.clip_by_global_norm(clip), rule)
+
+
+def _one(count):
+    return jnp.ones((), jnp.float32)
+
+
+def _scaled_by(schedule: Trapezoid) -> optax.GradientTransformation:
+    def init(params):
+        return Planned(jnp.zeros((), jnp.int32), jnp.asarray(schedule.steps, jnp.int32))
+
+    def update(updates, state, params=None):
+        rate = schedule.at(state.count, state.planned_steps)
+        updates = jax.tree.map(lambda leaf: rate * leaf, updates)
+        return updates, Planned(state.count + 1, state.planned_steps)
+
+    return optax.GradientTransformation(init, update)
 
 
 def _hidden_matrices(params):

@@ -12,8 +12,10 @@ import optax
 from flax import struct
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, Int32, UInt32
 
+from cfr_jax.data.augment import Sampling
+from cfr_jax.data.device_pairs import Shapes, draw_pairs
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks.cfr.iterations import Step
 from cfr_jax.networks.inputs import Cloud
@@ -24,6 +26,11 @@ Unroll = Callable[[dict, Cloud, Cloud, Hashable], Iterator[Step]]
 """The iterations of a network on a pair: `iterations.unroll`, or `rpmnet.unroll`."""
 
 PRECISIONS = ("float32", "tensorfloat32", "bfloat16")
+# What the products of the learned layers run at: those whose precision is not stated in the
+# program. Distances, covariances, affinities and motions state theirs, and stay float32 in every
+# case. With "bfloat16" it is the heavy extraction's activations that are less precise
+# (`Settings.activations`). A CPU multiplies in float32 whatever is asked for.
+_PRODUCTS = {"float32": "float32", "tensorfloat32": "tensorfloat32", "bfloat16": "tensorfloat32"}
 
 
 @struct.dataclass
@@ -80,7 +87,43 @@ def train_step(state: TrainState, batch: dict, *, recipe: Recipe) -> tuple[Train
     than `max_skipped` came in a row none changes anything, so that the loop, which looks but now
     and then, finds it so.
     """
-    with jax.default_matmul_precision(_of_products(recipe.precision)):
+    return _advance(state, batch, recipe)
+
+
+@functools.partial(jax.jit, static_argnames=("recipe", "sampling"), donate_argnames=("state",))
+def train_on_drawn(
+    state: TrainState,
+    shapes: Shapes,
+    seed: UInt32[Array, ""],
+    items: Int32[Array, "k b"],
+    positions: UInt32[Array, "k b"],
+    *,
+    recipe: Recipe,
+    sampling: Sampling,
+) -> tuple[TrainState, PairLoss]:
+    """`k` steps in one go, each on pairs that the devices draw (`data.device_pairs`): shape
+    `items[i]` at place `positions[i]` of the stream. Losses of all k b pairs."""
+
+    def draw(shapes, seed, items, positions):
+        return draw_pairs(shapes, seed, items, positions, sampling)
+
+    def one(state, stretch):
+        # each device draws its own share
+        batch = jax.shard_map(
+            draw,
+            mesh=recipe.mesh,
+            in_specs=(P(), P(), P(AXIS), P(AXIS)),
+            out_specs=P(AXIS),
+            check_vma=False,
+        )(shapes, seed, *stretch)
+        return _advance(state, batch, recipe)
+
+    state, measured = jax.lax.scan(one, state, (items, positions))
+    return state, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), measured)
+
+
+def _advance(state, batch, recipe):
+    with jax.default_matmul_precision(_PRODUCTS[recipe.precision]):
         gradient, measured = jax.shard_map(
             functools.partial(_mean_gradient, recipe=recipe),
             mesh=recipe.mesh,
@@ -109,18 +152,6 @@ def train_step(state: TrainState, batch: dict, *, recipe: Recipe) -> tuple[Train
         skipped_in_row=jnp.where(sound, 0, state.skipped_in_row + 1),
     )
     return after, measured
-
-
-def _of_products(precision: str) -> str:
-    """What the products of the MLPs run at: those whose precision is not stated in the program.
-
-    Distances, covariances, affinities and motions state theirs, and stay float32 in every case; so
-    does everything that is stored or summed. A CPU multiplies in float32 whatever is asked for.
-    """
-    if precision != "bfloat16":
-        return precision
-    # on a TPU one pass of its unit; a GPU's default would be TF32
-    return {"cpu": "float32", "tpu": "bfloat16"}.get(jax.default_backend(), "BF16_BF16_F32")
 
 
 def _mean_gradient(params, batch, *, recipe):
@@ -169,17 +200,30 @@ def _cloud(pair, side):
     return Cloud(points, normals, neighbors)
 
 
-@functools.partial(jax.jit, static_argnames=("unroll", "settings", "mesh"))
-def predict(params: dict, batch: dict, *, unroll: Unroll, settings: Hashable, mesh: Mesh) -> Array:
-    """Transforms (b, L, 4, 4) of a batch that needs no training; each device takes its share, pair
-    after pair, all in float32."""
+@functools.partial(jax.jit, static_argnames=("unroll", "settings", "mesh", "pairs_at_once"))
+def predict(
+    params: dict,
+    batch: dict,
+    *,
+    unroll: Unroll,
+    settings: Hashable,
+    mesh: Mesh,
+    pairs_at_once: int = 1,
+) -> Array:
+    """Transforms (b, L, 4, 4) of a batch that needs no training; each device takes its share,
+    `pairs_at_once` pairs vectorized and the rest one after the other, all in float32."""
 
     def of_pair(params, pair):
         source, target = (_cloud(pair, side) for side in ("source", "target"))
         return jnp.stack([step.transform for step in unroll(params, source, target, settings)])
 
     def of_share(params, pairs):
-        return jax.lax.map(functools.partial(of_pair, params), pairs)
+        size = len(pairs["transform"])
+        return jax.lax.map(
+            functools.partial(of_pair, params),
+            pairs,
+            batch_size=None if pairs_at_once == 1 else min(pairs_at_once, size),
+        )
 
     with jax.default_matmul_precision("float32"):
         return jax.shard_map(

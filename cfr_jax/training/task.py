@@ -43,6 +43,12 @@ class Task:
         """Of all phases."""
         return sum(phase.steps for phase in self.phases)
 
+    def planned(self, steps: int) -> Task:
+        """The same, its only phase `steps` long."""
+        phase = dataclasses.replace(self.phases[0], steps=steps)
+        schedule = dataclasses.replace(self.schedule, steps=steps)
+        return dataclasses.replace(self, phases=(phase,), schedule=schedule)
+
 
 def prepare(config: TrainingConfig, workdir: Path) -> Task:
     """The task of a config; refined truths, and that all scans can be read, are kept in `workdir`.
@@ -59,7 +65,8 @@ def prepare(config: TrainingConfig, workdir: Path) -> Task:
     schedule = optimizers.make_schedule(
         config.train.schedule,
         peak_rate=config.train.peak_rate,
-        steps=sum(phase.steps for phase in config.phases),
+        # of minutes, how many steps they are is known later
+        steps=1 if config.train.minutes else sum(phase.steps for phase in config.phases),
         warmup=config.train.warmup,
         cooldown=config.train.cooldown,
     )

@@ -13,21 +13,38 @@ from cfr_jax.training.learner import Learner
 _RECALL = 5.0, 0.1  # degrees, and radii
 
 
-def place(batch: dict, mesh: Mesh) -> dict:
-    """The pairs of `sources.fixed_pairs` over the devices, the last one repeated to fill them."""
+def place(batch: dict, mesh: Mesh, pairs_at_once: int = 1) -> dict:
+    """The pairs of `sources.fixed_pairs` over the devices, the last one repeated to fill them,
+    `pairs_at_once` (or all, if they are fewer) in each."""
     count = len(batch["transform"])
-    full = -(-count // mesh.size) * mesh.size
+    share = -(-count // mesh.size)
+    share = -(-share // min(pairs_at_once, share)) * min(pairs_at_once, share)
+    full = share * mesh.size
     rows = np.minimum(np.arange(full), count - 1)[devices.share_of(full)]
     return devices.spread(jax.tree.map(lambda leaf: leaf[rows], batch), mesh)
 
 
-def validate(chosen: Learner, params: dict, placed: dict, truth: np.ndarray, mesh: Mesh) -> dict:
+def validate(
+    chosen: Learner,
+    params: dict,
+    placed: dict,
+    truth: np.ndarray,
+    mesh: Mesh,
+    pairs_at_once: int = 1,
+) -> dict:
     """Rotation (degrees) and translation errors of the last transform against `truth` (b, 4, 4),
     their recall, and the mean rotation error of every iteration; and all transforms (b, L, 4, 4).
 
     Raises `Diverged` where a transform is not finite.
     """
-    found = step.predict(params, placed, unroll=chosen.unroll, settings=chosen.validated, mesh=mesh)
+    found = step.predict(
+        params,
+        placed,
+        unroll=chosen.unroll,
+        settings=chosen.validated,
+        mesh=mesh,
+        pairs_at_once=pairs_at_once,
+    )
     transforms = devices.gather(found)[: len(truth)].astype(np.float64)
     truth = np.asarray(truth, np.float64)
     lost = np.count_nonzero(~np.isfinite(transforms).all(axis=(1, 2, 3)))

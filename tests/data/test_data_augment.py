@@ -125,7 +125,7 @@ def test_noise_has_the_strength_asked_for_on_every_axis(sphere):
 
 def test_sensor_noise_lies_along_the_rays_and_grows_with_distance_squared(sphere, monkeypatch):
     monkeypatch.setattr(augment, "_direction", lambda rng: np.array([0.0, 0.0, 1.0]))
-    monkeypatch.setattr(augment, "_SENSOR_AWAY", (2.0, 2.0))
+    monkeypatch.setattr(augment, "SENSOR_AWAY", (2.0, 2.0))
     points = np.repeat(sphere.astype(np.float64), 20, axis=0)
     sampling = still(sensor_scale=(0.01, 0.01))
 

@@ -18,16 +18,17 @@ from cfr_jax.training.config import Phase
 HERE = Path(__file__).parent
 
 
-def config(folder):
+def config(folder, draw="host"):
     """Four steps of eight pairs, small enough to compile quickly."""
     given = samples.config(samples.write_corpus(folder / "ellipsoids.h5"))
     given.phases = (Phase(steps=4, points=24, neighbors=6, batch=8),)
     given.log_every = given.checkpoint_every = 1
     given.validate_every = 4
+    given.train.draw = draw
     return given
 
 
-def start(folder, workdir, devices=1, *, stop_after=0, **group):
+def start(folder, workdir, devices=1, *, draw="host", stop_after=0, **group):
     """A process that trains by `config`; see `main` below."""
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE)]),
@@ -36,7 +37,7 @@ def start(folder, workdir, devices=1, *, stop_after=0, **group):
         "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
-    given = samples.in_text(config(folder))
+    given = samples.in_text(config(folder, draw))
     order = json.dumps({"workdir": str(workdir), "stop_after": stop_after, "group": group})
     return subprocess.Popen(
         [sys.executable, __file__, given, order],
@@ -61,12 +62,12 @@ def free_port():
         return found.getsockname()[1]
 
 
-def pair_of_processes(folder, workdir, stop_after=0):
+def pair_of_processes(folder, workdir, stop_after=0, **more):
     coordinator = f"127.0.0.1:{free_port()}"
     return [
         start(
             folder, workdir, stop_after=stop_after,
-            coordinator=coordinator, processes=2, process=number,
+            coordinator=coordinator, processes=2, process=number, **more,
         )
         for number in range(2)
     ]  # fmt: skip
@@ -109,6 +110,19 @@ def test_two_processes_train_together_and_each_goes_on_from_the_others_checkpoin
     finish(*pair_of_processes(folder, folder / "handed", stop_after=2))
     finish(start(folder, folder / "handed"))
     assert_close(losses(folder / "handed"), curve)
+
+
+@pytest.mark.slow
+def test_any_number_of_devices_and_processes_draws_the_same_pairs(alone):
+    folder, _ = alone
+    finish(start(folder, folder / "drawn", draw="device"))
+    curve = losses(folder / "drawn")
+
+    finish(start(folder, folder / "drawn by eight", devices=8, draw="device"))
+    finish(*pair_of_processes(folder, folder / "drawn by two", draw="device"))
+
+    assert_close(losses(folder / "drawn by eight"), curve)
+    assert_close(losses(folder / "drawn by two"), curve)
 
 
 def test_a_batch_that_the_devices_cannot_share_is_refused():

@@ -259,11 +259,11 @@ def test_weights_to_start_from_are_measured_first_and_kept_if_no_better_come(
     given.train.start_from = str(begun)
     found = samples.cheap_validation
 
-    def worse_every_time(chosen, params, placed, truth, mesh):
+    def worse_every_time(chosen, params, *others):
         same = np.array_equal(
             params["features"]["kernel_1"], weights.load_params(begun)["features"]["kernel_1"]
         )
-        return found(chosen, params, placed, truth, mesh) | {"rotation_mean": 1.0 + (not same)}
+        return found(chosen, params, *others) | {"rotation_mean": 1.0 + (not same)}
 
     monkeypatch.setattr(samples, "cheap_validation", worse_every_time)
     best = run(given, tmp_path)

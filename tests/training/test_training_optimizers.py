@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cfr_jax.training.optimizers import OPTIMIZERS, make_optimizer, make_schedule
+from cfr_jax.training.optimizers import OPTIMIZERS, make_optimizer, make_schedule, planned
 
 
 @pytest.fixture(autouse=True)
@@ -41,6 +41,58 @@ def test_wsd_stays_and_then_falls_in_a_straight_line():
 
     np.testing.assert_allclose(found[10:81], 1.0, rtol=1e-6)
     np.testing.assert_allclose(found[80:], np.linspace(1, 0.001, 21), atol=1e-5)
+
+
+def test_a_trapezoid_rises_from_zero_stays_and_falls_to_zero():
+    found = rates("trapezoid")
+
+    np.testing.assert_allclose(found[:10], np.linspace(0.1, 1, 10), rtol=1e-5)
+    np.testing.assert_allclose(found[10:81], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(found[80:], np.linspace(1, 0, 21), atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", OPTIMIZERS)
+def test_a_trapezoid_can_be_made_longer_without_another_program(kind):
+    def made(steps):
+        schedule = make_schedule("trapezoid", peak_rate=0.05, steps=steps, warmup=0.1, cooldown=0.5)
+        return make_optimizer(kind, schedule, clip=1.0, weight_decay=1e-3)
+
+    rule, wanted = made(7), made(20)
+    x = jnp.array([[1.0, -2.0], [0.5, 1.0]])
+    state, same = planned(rule.init(x), jnp.int32(20)), wanted.init(x)
+
+    for step in range(20):
+        gradient = jnp.cos(x * step)
+        updates, state = rule.update(gradient, state, x)
+        expected, same = wanted.update(gradient, same, x)
+        np.testing.assert_array_equal(updates, expected)
+    # the last rate is a tenth of the peak, as one of the ten steps of the cooldown is left
+    assert float(
+        make_schedule("trapezoid", peak_rate=1.0, steps=20, warmup=0.1, cooldown=0.5)(19)
+    ) == pytest.approx(0.1)
+
+
+def test_another_schedule_is_not_planned():
+    rule = make_optimizer("adamw", lambda _: 0.1, clip=1.0, weight_decay=0.0)
+    state = rule.init(jnp.ones(2))
+
+    assert planned(state, jnp.int32(5)) is state
+
+
+@pytest.mark.parametrize("kind", OPTIMIZERS)
+def test_under_a_trapezoid_every_optimizer_is_what_it_is_under_that_rate(kind):
+    schedule = make_schedule("trapezoid", peak_rate=0.05, steps=10, warmup=0.3, cooldown=0.3)
+    rule = make_optimizer(kind, schedule, clip=1.0, weight_decay=1e-2)
+    plain = make_optimizer(kind, lambda step: schedule(step), clip=1.0, weight_decay=1e-2)
+    x = y = jax.random.normal(jax.random.key(0), (33, 32))
+    state, other = rule.init(x), plain.init(y)
+
+    for step in range(10):
+        updates, state = rule.update(jnp.sin(3 * x + step), state, x)
+        wanted, other = plain.update(jnp.sin(3 * y + step), other, y)
+        x, y = x + updates, y + wanted
+
+    np.testing.assert_allclose(x, y, atol=1e-5)
 
 
 def test_constant_stays():

@@ -112,4 +112,4 @@ def bind(params: dict) -> CFR:
 
 def _heavy_features(network, cloud, settings):
     raw = raw_features(cloud.points, cloud.normals, cloud.neighbors, ppf=settings.ppf)
-    return network.features(raw, cloud.mask)
+    return network.features(raw, cloud.mask, settings.activations)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from cfr_jax.networks.extraction import pooled_features
+from cfr_jax.networks.extraction import Activations, pooled_features
 from cfr_jax.networks.layers import Layer, apply_layer, group_norm
 from cfr_jax.networks.pooling import pooled_layer
 
@@ -39,7 +39,10 @@ class PointFeatures(nn.Module):
 
     @nn.compact
     def __call__(
-        self, raw: Float[Array, "n k c"], mask: Bool[Array, " n"] | None = None
+        self,
+        raw: Float[Array, "n k c"],
+        mask: Bool[Array, " n"] | None = None,
+        activations: Activations = "float32",
     ) -> Float[Array, "n d"]:
         layers, width = [], raw.shape[-1]
         for i in range(3):
@@ -52,7 +55,9 @@ class PointFeatures(nn.Module):
                 )
             )
             width = CHANNELS
-        return pooled_features(tuple(layers), raw, groups=GROUPS, mask=mask)
+        return pooled_features(
+            tuple(layers), raw, groups=GROUPS, mask=mask, activations=activations
+        )
 
 
 class Cascade(nn.Module):

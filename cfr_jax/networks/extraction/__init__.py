@@ -21,6 +21,7 @@ layer's follow from the pooled values alone, the first layer's from sums of seve
 from __future__ import annotations
 
 import functools
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -28,28 +29,38 @@ from jaxtyping import Array, Bool, Float
 
 from cfr_jax.networks.extraction.backward import backward
 from cfr_jax.networks.extraction.forward import forward
+from cfr_jax.networks.extraction.mixed import pooled_mixed
 from cfr_jax.networks.layers import Layer
 from cfr_jax.runtime.vectorizing import cloud_by_cloud
 
-__all__ = ["pooled_features"]
+__all__ = ["Activations", "pooled_features"]
 
 
-@functools.partial(jax.jit, static_argnames=("groups",))
+Activations = Literal["float32", "bfloat16"]
+
+
+@functools.partial(jax.jit, static_argnames=("groups", "activations"))
 def pooled_features(
     layers: tuple[Layer, Layer, Layer],
     raw: Float[Array, "n k c"],
     *,
     groups: int,
     mask: Bool[Array, " n"] | None = None,
+    activations: Activations = "float32",
 ) -> Float[Array, "n d"]:
     """Per-neighbor MLP and maximum over the neighbors, one feature per point.
 
     Rows of masked points enter no statistic; their own features are zero. Differentiates by its own
     rule, once, with memory for one activation (at most `tiles.KEPT` numbers of it) and its
-    gradient.
+    gradient. `activations` says what the values between the layers are rounded to and multiplied
+    in: for "bfloat16" see `mixed`.
     """
     n = raw.shape[0]
     valid = jnp.ones(n, raw.dtype) if mask is None else mask.astype(raw.dtype)
+    if activations not in ("float32", "bfloat16"):
+        raise ValueError(f"activations: got {activations!r}, wanted 'float32' or 'bfloat16'")
+    if activations == "bfloat16":
+        return pooled_mixed(layers, raw, valid, groups) * valid[:, None]
     return _pooled(layers, raw, valid, groups) * valid[:, None]
 
 

@@ -118,6 +118,11 @@ class Bar:
         options = {"total": total, "initial": step, "disable": not shown, "mininterval": 5}
         self._bar = Progress(desc="training", unit=" steps", **options)
 
+    def plan(self, total: int) -> None:
+        """There will be so many steps."""
+        self._bar.total = total
+        self._bar.refresh()
+
     def step(self, step: int) -> None:
         """Steps done so far."""
         self._bar.update(step - self._bar.n)

@@ -34,6 +34,7 @@ class Reporter:
         self.clock = Clock(**about["clock"])
         self._workdir, self._task, self._about = workdir, task, about
         self._waiting: list[PairLoss] = []
+        self._steps = 0  # that were measured and not yet written
         self._written = self.clock.read()["seconds"]
         self._compiling = False
         self._bar = Bar(task.steps, about["step"], shown=is_first())
@@ -82,12 +83,18 @@ class Reporter:
             jax.block_until_ready(self._waiting[-1].total)
         self.clock.stop()
 
-    def step(self, done: int, measured: PairLoss) -> None:
-        """Takes note of one step, and waits for the one before: the device has always one to do,
+    def plan(self, task: Task) -> None:
+        """Says how many steps there will be, where that was not known before."""
+        self._task = task
+        self._bar.plan(task.steps)
+
+    def step(self, done: int, measured: PairLoss, steps: int = 1) -> None:
+        """Takes note of some steps, and waits for those before: the device has always some to do,
         and never many."""
         if self._waiting:
             jax.block_until_ready(self._waiting[-1].total)
         self._waiting.append(measured)
+        self._steps += steps
         if self._compiling:
             self._bar.forget_time()
         self._compiling = False
@@ -95,13 +102,13 @@ class Reporter:
 
     def measured(self, done: int, skipped: int) -> None:
         """Writes the means since the last call."""
-        used, steps = self.clock.read(), len(self._waiting)
+        used = self.clock.read()
         line = {
             "step": done,
             **summarize(self._waiting),
             # the optimizer has not seen the steps that were left out
             "learning_rate": float(self._task.schedule(np.int32(max(0, done - 1 - skipped)))),
-            "steps_per_second": steps / max(used["seconds"] - self._written, 1e-9),
+            "steps_per_second": self._steps / max(used["seconds"] - self._written, 1e-9),
             # all of a training, over its restarts, without validations
             "training_seconds": used["seconds"],
             "processor_seconds": used["processor_seconds"],
@@ -111,7 +118,7 @@ class Reporter:
         if self._journal is not None and self._board is not None:
             self._journal.write(line)
             self._board.training(line, self._waiting)
-        self._waiting, self._written = [], used["seconds"]
+        self._waiting, self._steps, self._written = [], 0, used["seconds"]
         self._bar.measured(line)
 
     def validated(self, done: int, found: dict) -> None:

@@ -1,0 +1,139 @@
+"""How many pairs a second are trained on that the device draws: python benchmarks/train_drawn.py
+
+For each precision: seconds to compile, pairs per second of several steps in one program with the
+drawing of their pairs, and what share of that time the drawing alone takes. Made for accelerators;
+`--points 64 --neighbors 12 --batch 4 --steps 2` is enough to try it on a CPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from train_step import ellipsoids, start
+
+from cfr_jax.data.augment import Sampling
+from cfr_jax.data.device_pairs import Shapes, draw_pairs
+from cfr_jax.networks.cfr.iterations import unroll
+from cfr_jax.networks.inputs import Settings
+from cfr_jax.training import devices, optimizers, step
+
+
+def main() -> None:
+    """Prints a line of JSON for each precision."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--points", type=int, default=717)
+    parser.add_argument("--neighbors", type=int, default=64)
+    parser.add_argument("--batch", type=int, default=64)
+    parser.add_argument("--steps", type=int, default=25, help="in one program")
+    parser.add_argument("--repeats", type=int, default=4, help="of that program, timed")
+    parser.add_argument("--precisions", nargs="+", default=step.PRECISIONS[::-1])
+    args = parser.parse_args()
+    print(f"{len(jax.devices())} x {jax.devices()[0].device_kind}, jax {jax.__version__}")
+    sizes = {name: vars(args)[name] for name in ("points", "neighbors", "batch", "steps")}
+    drawing = measure_drawing(**sizes, repeats=args.repeats)
+    for precision in args.precisions:
+        found = measure(precision, **sizes, repeats=args.repeats)
+        share = drawing["ms_per_step"] / found["ms_per_step"]
+        told = {**found, "drawing_ms": drawing["ms_per_step"], "drawing_share": round(share, 3)}
+        print(json.dumps(told), flush=True)
+
+
+def measure(
+    precision: str, *, points: int, neighbors: int, batch: int, steps: int, repeats: int
+) -> dict:
+    """Compiling, and the steady rate of training in `precision` over all devices."""
+    mesh = devices.make_mesh()
+    schedule = optimizers.make_schedule("trapezoid", peak_rate=1e-3, steps=10_000, warmup=0.02)
+    optimizer = optimizers.make_optimizer("muon", schedule, clip=1.0, weight_decay=1e-5)
+    settings = Settings(
+        neighbors=neighbors,
+        detach_motion=True,
+        activations="bfloat16" if precision == "bfloat16" else "float32",
+    )
+    recipe = step.Recipe(
+        unroll=unroll,
+        settings=settings,
+        optimizer=optimizer,
+        mesh=mesh,
+        correspondence_weight=0.05,
+        average_decay=0.999,
+        pairs_at_once=batch // mesh.size,
+        precision=precision,
+        max_skipped=20,
+    )
+    state, given = start(optimizer, mesh), _placed(batch, steps, mesh)
+    began = time.perf_counter()
+    lowered = step.train_on_drawn.lower(
+        state, *given, recipe=recipe, sampling=_sampling(points, neighbors)
+    )
+    traced = time.perf_counter()
+    program = lowered.compile()
+    compiled = time.perf_counter()
+    state, measured = program(state, *given)
+    jax.block_until_ready(measured.total)
+    begun = time.perf_counter()
+    for _ in range(repeats):
+        state, measured = program(state, *given)
+    jax.block_until_ready(measured.total)
+    seconds = (time.perf_counter() - begun) / (repeats * steps)
+    return {
+        "precision": precision,
+        "batch": batch,
+        "points": points,
+        "neighbors": neighbors,
+        "pairs_per_second": round(batch / seconds, 1),
+        "ms_per_step": round(1e3 * seconds, 3),
+        "trace_s": round(traced - began, 1),
+        "compile_s": round(compiled - traced, 1),
+        "scratch_GiB": round(program.memory_analysis().temp_size_in_bytes / 2**30, 2),
+        "loss": float(jnp.mean(measured.total)),
+        "skipped": int(state.skipped),
+    }
+
+
+def measure_drawing(*, points: int, neighbors: int, batch: int, steps: int, repeats: int) -> dict:
+    """The drawing of pairs alone, on one device: its share of a batch."""
+    mesh = devices.make_mesh()
+    shapes, seed, items, positions = _placed(batch, steps, mesh)
+    share = batch // mesh.size
+    rows = jnp.asarray(np.asarray(items)[0, :share]), jnp.asarray(np.asarray(positions)[0, :share])
+
+    @functools.partial(jax.jit, static_argnames=("sampling",))
+    def draw(shapes, seed, items, positions, sampling):
+        pairs = draw_pairs(shapes, seed, items, positions, sampling)
+        return jax.tree.map(lambda leaf: leaf.astype(jnp.float32).sum(), pairs)
+
+    one = jax.device_put((jax.tree.map(np.asarray, shapes), np.asarray(seed)))
+    run = functools.partial(draw, *one, *rows, sampling=_sampling(points, neighbors))
+    jax.block_until_ready(run())
+    began = time.perf_counter()
+    for _ in range(repeats * steps):
+        found = run()
+    jax.block_until_ready(found)
+    seconds = (time.perf_counter() - began) / (repeats * steps)
+    return {"ms_per_step": round(1e3 * seconds, 3)}
+
+
+def _sampling(points: int, neighbors: int) -> Sampling:
+    """That of configs/object.py."""
+    return Sampling(
+        points=points, neighbors=neighbors, keep=(0.55, 0.85), both_ways=0.5, near=0.3,
+        centered=0.4, any_orientation=0.3, scale=(0.8, 1.2), estimated_normals=0.6,
+    )  # fmt: skip
+
+
+def _placed(batch: int, steps: int, mesh) -> tuple:
+    shapes, seed = devices.replicate((Shapes.of(ellipsoids()), np.uint32(0)), mesh)
+    places = np.arange(steps * batch).reshape(steps, batch)
+    items, positions = (places % len(ellipsoids())).astype(np.int32), places.astype(np.uint32)
+    return shapes, seed, *(devices.spread_steps(rows, mesh) for rows in (items, positions))
+
+
+if __name__ == "__main__":
+    main()
