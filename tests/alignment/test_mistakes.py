@@ -149,10 +149,6 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_there_are_mistakes_enough():
-    assert len(MISTAKES) >= 40
-
-
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_told_with_the_way_out(mistake, place, monkeypatch, capsys):
     # given
