@@ -66,7 +66,8 @@ def _closest_by_differences(queries, points, mask):
 def squares(queries: Float[Array, "... 3"], points: Float[Array, "... 3"]) -> Float[Array, ...]:
     """Squared distances, by differences: |a|^2 - 2ab + |b|^2 cancels to nothing for close points
     far from the origin."""
-    return sum((queries[..., axis] - points[..., axis]) ** 2 for axis in range(3))
+    x, y, z = ((queries[..., axis] - points[..., axis]) ** 2 for axis in range(3))
+    return x + y + z
 
 
 def far_where_masked(
