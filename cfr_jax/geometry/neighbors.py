@@ -1,23 +1,25 @@
 """The K nearest points of each point: exact, self dropped by index, far ones replaced.
 
-Two ways to the same sets. `nearest` is pure JAX for any device; `nearest_on_host` is for clouds
-that are still in host memory. Only the *set* of a point's neighbors matters to the network, so
-neither sorts; both break ties by the lower index. (Distances that agree to the last bit or two of
-float32 may fall on either side of the K-th place.) Everything downstream takes indices.
+Three ways to the same sets. `nearest` is pure JAX, and lowers to one search on CPUs and to another
+on accelerators; `nearest_on_host` is for clouds that are still in host memory. Only the *set* of a
+point's neighbors matters to the network, so none of them promises an order; all break ties by the
+lower index. (Distances that agree to the last bit or two of float32 may fall on either side of the
+K-th place.) Everything downstream takes indices.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
 
-from cfr_jax.geometry.selection import k_smallest, nth_set_bit, pack
+from cfr_jax.geometry.closest import far_where_masked, squares
+from cfr_jax.geometry.selection import k_smallest, k_smallest_of_groups, nth_set_bit, pack
 
-_BLOCK = 1 << 16  # distances held at a time: they stay in a core's cache
+_BLOCK = 1 << 16  # distances held at a time on a CPU: they stay in a core's cache
 # On the host: up to so many points comparing all beats the tree (5 to 13 ms at 1,024 points,
 # 25 to 31 at 2,048), a block of rows at a time.
 _FEW = 1536
@@ -46,6 +48,17 @@ def nearest(
         )
     points = points.astype(jnp.float32)  # as the host measures; the search works on its bits
     limit = jnp.inf if radius is None else radius * radius
+    return lax.platform_dependent(
+        points,
+        mask,
+        cpu=lambda points, mask: _nearest_by_bits(points, mask, k, limit),
+        default=lambda points, mask: _nearest_by_groups(points, mask, k, limit),
+    )
+
+
+def _nearest_by_bits(points, mask, k, limit):
+    """`nearest` as a CPU does it."""
+    n = points.shape[0]
 
     def choose(row, square):
         if mask is not None:
@@ -60,6 +73,18 @@ def nearest(
     return _by_rows(points, choose)
 
 
+def _nearest_by_groups(points, mask, k, limit, **sizes):
+    """`nearest` as an accelerator does it: a handful of kernels."""
+
+    def square_of(row, query, column, point):
+        return jnp.where(row == column, jnp.inf, squares(query, point))
+
+    square, chosen = k_smallest_of_groups(
+        points, far_where_masked(points, mask), k, square_of, **sizes
+    )
+    return jnp.where((square <= limit) & (square < jnp.inf), chosen, chosen[:, :1])
+
+
 def first_in_ball(
     points: Float[Array, "n 3"], k: int, radius: float, mask: Bool[Array, " n"] | None = None
 ) -> Int32[Array, "n k"]:
@@ -68,7 +93,15 @@ def first_in_ball(
     RPM-Net's neighborhoods: not the nearest, and with repeated centers where a ball is sparse. A
     rigid motion does not change them.
     """
+    return lax.platform_dependent(
+        points,
+        mask,
+        cpu=lambda points, mask: _first_by_bits(points, mask, k, radius),
+        default=lambda points, mask: _first_by_groups(points, mask, k, radius),
+    )
 
+
+def _first_by_bits(points, mask, k, radius):
     def choose(row, square):
         inside = (square <= radius * radius) & (row != jnp.arange(points.shape[0]))
         if mask is not None:
@@ -80,7 +113,20 @@ def first_in_ball(
     return _by_rows(points, choose)
 
 
-def _by_rows(points, choose):
+def _first_by_groups(points, mask, k, radius, **sizes):
+    def place_of(row, query, column, point):
+        inside = (squares(query, point) <= radius * radius) & (row != column)
+        return jnp.where(inside, column.astype(query.dtype), jnp.inf)
+
+    n = points.shape[0]
+    table = far_where_masked(points, mask)
+    place, found = k_smallest_of_groups(points, table, min(k, n), place_of, **sizes)
+    row = jnp.arange(n, dtype=jnp.int32)[:, None]
+    missing = jnp.broadcast_to(row, (n, max(0, k - n)))
+    return jnp.concatenate([jnp.where(place < jnp.inf, found, row), missing], axis=1)
+
+
+def _by_rows(points, choose: Callable):
     """`choose(row, square)` for blocks of rows: their numbers (r, 1) and their squared distances to
     all points (r, n) in, their neighbors (r, k) out; all rows (n, k) back."""
     n = points.shape[0]
@@ -90,49 +136,11 @@ def _by_rows(points, choose):
 
     def block(start):
         here = lax.dynamic_slice_in_dim(queries, start, rows)
-        # by differences: |a|^2 - 2ab + |b|^2 cancels to nothing for close points far from the
-        # origin
-        square = sum((here[:, axis, None] - points[None, :, axis]) ** 2 for axis in range(3))
+        square = squares(here[:, None], points)
         return choose((start + jnp.arange(rows, dtype=jnp.int32))[:, None], square)
 
     found = lax.map(block, rows * jnp.arange(blocks, dtype=jnp.int32))
     return found.reshape(blocks * rows, -1)[:n]
-
-
-class Closest(NamedTuple):
-    """For each query the closest point of a cloud, and its squared distance."""
-
-    index: Int32[Array, " n"]
-    square: Float[Array, " n"]
-
-
-def closest(
-    queries: Float[Array, "n 3"],
-    points: Float[Array, "m 3"],
-    mask: Bool[Array, " m"] | None = None,
-) -> Closest:
-    """The closest valid point to each query, by comparing all; for clouds centered near zero.
-
-    |y|^2 - 2 x y ranks the points with one matrix product. Its cancellation can only confuse points
-    that lie within float32's rounding of each other; the distance is then taken by differences.
-    """
-    norms = jnp.sum(points * points, axis=1)
-    if mask is not None:
-        norms = jnp.where(mask, norms, jnp.inf)
-    m = points.shape[0]
-    rows = max(1, min(queries.shape[0], _BLOCK * 16 // m))
-    blocks = -(-queries.shape[0] // rows)
-    padded = jnp.pad(queries, ((0, blocks * rows - queries.shape[0]), (0, 0)))
-
-    def block(here):
-        rank = norms - 2 * jnp.matmul(here, points.T, precision=lax.Precision.HIGHEST)
-        # two plain reductions: XLA's argmin on CPU is not vectorized
-        best = jnp.min(rank, axis=1, keepdims=True)
-        return jnp.min(jnp.where(rank <= best, jnp.arange(m, dtype=jnp.int32), m - 1), axis=1)
-
-    index = lax.map(block, padded.reshape(blocks, rows, 3)).reshape(-1)[: queries.shape[0]]
-    offset = queries - points[index]
-    return Closest(index, jnp.sum(offset * offset, axis=1))
 
 
 def nearest_on_host(

@@ -1,6 +1,12 @@
-"""The k smallest of each row, exact and with ties in order, by vector arithmetic on bits."""
+"""The k smallest of each row, exact and with ties in order.
+
+By vector arithmetic on bits for CPUs, where sorting is slow; by sorting little for accelerators.
+"""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Callable
 
 import jax.numpy as jnp
 from jax import lax
@@ -34,6 +40,60 @@ def k_smallest(values: Float[Array, "r n"], k: int) -> Int32[Array, "r k"]:
     last_equal = nth_set_bit(words_equal, spare[:, None] - 1)
     taken = below | (equal & (jnp.arange(n) <= last_equal))
     return nth_set_bit(pack(taken), jnp.broadcast_to(jnp.arange(k), (values.shape[0], k)))
+
+
+def k_smallest_of_groups(
+    queries: Float[Array, "n 3"],
+    points: Float[Array, "m 3"],
+    k: int,
+    value_of: Callable[[Array, Array, Array, Array], Array],
+    *,
+    few: int = 512,
+    entries: int = 1 << 26,
+) -> tuple[Float[Array, "n k"], Int32[Array, "n k"]]:
+    """The k smallest of each query's values over all points, rising, and the points' numbers.
+
+    `value_of(row, query, column, point)` is a value: of numbers (r, 1), coordinates (r, 1, 3),
+    numbers (r or 1, c), coordinates (r or 1, c, 3) it makes values (r, c), infinite for points at
+    infinity. It is asked twice. First the points are taken in groups, and only the least value of
+    each group is stored: the k smallest values lie in the k groups whose least is smallest. Then
+    those groups are looked at point by point. With groups of sqrt(m / k) points 2 sqrt(m k) values
+    are sorted instead of m: at 12,000 points and k = 64 a seventh. Ties go to the lower number in
+    both rounds, for the groups are runs of points and stay in order.
+
+    Up to `few` points are sorted as they are; queries come in blocks that sort `entries` values at
+    a time, 256 MiB of float32, and no block stores all distances.
+    """
+    n, m = queries.shape[0], points.shape[0]
+    size = 1 if m <= few else 1 << round(math.log2(m / k) / 2)
+    count = -(-m // size)
+    points = jnp.pad(points, ((0, count * size - m), (0, 0)), constant_values=jnp.inf)
+    columns = jnp.arange(count * size, dtype=jnp.int32)
+
+    def of_rows(row, query):
+        row, query = row[:, None], query[:, None]
+        values = value_of(row, query, columns[None], points[None])
+        if size == 1:
+            values, found = lax.top_k(-values, k)
+            return -values, found
+        least = jnp.min(values.reshape(-1, count, size), axis=2)
+        group = jnp.sort(lax.top_k(-least, k)[1], axis=1)
+        near = columns.reshape(count, size)[group].reshape(-1, k * size)
+        there = points.reshape(count, size, 3)[group].reshape(-1, k * size, 3)
+        values, place = lax.top_k(-value_of(row, query, near, there), k)
+        return -values, jnp.take_along_axis(near, place, axis=1)
+
+    blocks = -(-n * (count + (size > 1) * k * size) // entries)
+    if blocks == 1:
+        return of_rows(jnp.arange(n, dtype=jnp.int32), queries)
+    rows = -(-n // blocks)
+    cut = (
+        jnp.arange(blocks * rows, dtype=jnp.int32).reshape(blocks, rows),
+        jnp.pad(queries, ((0, blocks * rows - n), (0, 0))).reshape(blocks, rows, 3),
+    )
+    found = lax.map(lambda here: of_rows(*here), cut)
+    values, columns = (part.reshape(blocks * rows, k)[:n] for part in found)
+    return values, columns
 
 
 def pack(flags: Bool[Array, "r n"]) -> Array:

@@ -29,7 +29,8 @@ class Settings:
     ppf: PairFeature = "dot"
     match: Form = "auto"
     """How correspondences are found: "dense" stores the N x M affinities, "streamed" makes them
-    anew whenever it needs them, "auto" streams what is large. "log space" is RPM-Net's."""
+    anew whenever it needs them, "fused" does so inside a GPU's kernel, "auto" streams what is large
+    for the platform. "log space" is RPM-Net's."""
     detach_motion: bool = False
     """Stop gradients at the motion between iterations, as the paper trains."""
     activations: Activations = "float32"

@@ -19,7 +19,8 @@ from jaxtyping import Array, Bool, Float
 from cfr_jax.networks.layers import Layer, norm_of, projections
 
 _HIGHEST = lax.Precision.HIGHEST  # for what becomes a variance
-_TILE_ROWS = 1 << 14  # 64 MiB of 1,024 channels; clouds of the usual size are one tile
+# 64 MiB of 1,024 channels: clouds of the usual size are one tile. An accelerator takes more.
+_ON_CPU, _ELSEWHERE = 1 << 14, 1 << 18
 
 
 def pooled_layer(
@@ -28,18 +29,23 @@ def pooled_layer(
     *,
     groups: int,
     mask: Bool[Array, " n"] | None = None,
+    on_cpu: int = _ON_CPU,
+    elsewhere: int = _ELSEWHERE,
 ) -> Float[Array, " o"]:
-    """max over the valid rows of relu(groupnorm(x kernel + bias)), with a derivative of its own."""
+    """max over the valid rows of relu(groupnorm(x kernel + bias)), with a derivative of its own.
+
+    What is as wide as the output is made for so many rows at a time, by platform.
+    """
     valid = jnp.ones(x.shape[0], x.dtype) if mask is None else mask.astype(x.dtype)
-    return _pooled(layer, x, valid, groups)
+    return _pooled(layer, x, valid, groups, (on_cpu, elsewhere))
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _pooled(layer, x, valid, groups):
-    return _forward(layer, x, valid, groups)[0]
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _pooled(layer, x, valid, groups, rows):
+    return _forward(layer, x, valid, groups, rows)[0]
 
 
-def _forward(layer, x, valid, groups):
+def _forward(layer, x, valid, groups, rows):
     count = jnp.maximum(jnp.sum(valid), 1)
     mean = valid @ x / count
     centered = (x - mean) * valid[:, None]
@@ -48,46 +54,55 @@ def _forward(layer, x, valid, groups):
     norm = norm_of(channel_mean, ((covariance @ layer.kernel) * layer.kernel).sum(0), groups)
     # for a negative scale the smallest value becomes the largest
     sign = jnp.where(layer.scale >= 0, 1, -1).astype(x.dtype)
-    high, chosen = _highest(x, layer.kernel * sign, valid)
+    high, chosen = _highest(x, layer.kernel * sign, valid, rows)
     normal = (high * sign + layer.bias - norm.mean) * norm.rate
     pooled = jax.nn.relu(normal * layer.scale + layer.shift)
     return pooled, (layer, x, valid, (mean, covariance, channel_mean), norm, normal, chosen)
 
 
-def _highest(x, kernel, valid):
+def _highest(x, kernel, valid, rows):
     """Per channel the largest value of x kernel over the valid rows, and the first row that has it;
     0 and some row where none is valid."""
     n = x.shape[0]
-
-    def of_tile(x, valid, start):
-        z = jnp.where(valid[:, None] > 0, x @ kernel, -jnp.inf)
-        high = jnp.max(z, axis=0)
-        # two plain reductions: XLA's argmax on CPU is not vectorized
-        rows = start + jnp.arange(x.shape[0], dtype=jnp.int32)[:, None]
-        return high, jnp.min(jnp.where(z >= high, rows, n - 1), axis=0)
-
-    if n <= _TILE_ROWS:
-        high, chosen = of_tile(x, valid, 0)
+    if n <= min(rows):
+        high, chosen = _of_tile(x, kernel, valid, 0, n - 1)
     else:
-
-        def merge(best, tile):
-            high, chosen = of_tile(*tile)
-            higher = high > best[0]
-            return (jnp.where(higher, high, best[0]), jnp.where(higher, chosen, best[1])), None
-
-        count = -(-n // _TILE_ROWS)
-        more = count * _TILE_ROWS - n
-        tiles = (
-            jnp.pad(x, ((0, more), (0, 0))).reshape(count, _TILE_ROWS, -1),
-            jnp.pad(valid, (0, more)).reshape(count, _TILE_ROWS),
-            _TILE_ROWS * jnp.arange(count, dtype=jnp.int32),
-        )
-        lowest = jnp.full(kernel.shape[1], -jnp.inf, x.dtype), jnp.zeros(kernel.shape[1], jnp.int32)
-        (high, chosen), _ = lax.scan(merge, lowest, tiles)
+        cpu, default = (functools.partial(_of_tiles, rows=count) for count in rows)
+        high, chosen = lax.platform_dependent(x, kernel, valid, cpu=cpu, default=default)
     return jnp.where(jnp.isfinite(high), high, 0), jnp.minimum(chosen, n - 1)
 
 
-def _backward(groups, residuals, gradient):
+def _of_tile(x, kernel, valid, start, last):
+    z = jnp.where(valid[:, None] > 0, x @ kernel, -jnp.inf)
+    high = jnp.max(z, axis=0)
+    # two plain reductions: XLA's argmax on CPU is not vectorized
+    rows = start + jnp.arange(x.shape[0], dtype=jnp.int32)[:, None]
+    return high, jnp.min(jnp.where(z >= high, rows, last), axis=0)
+
+
+def _of_tiles(x, kernel, valid, *, rows):
+    n = x.shape[0]
+    if n <= rows:
+        return _of_tile(x, kernel, valid, 0, n - 1)
+
+    def merge(best, tile):
+        x, valid, start = tile
+        high, chosen = _of_tile(x, kernel, valid, start, n - 1)
+        higher = high > best[0]
+        return (jnp.where(higher, high, best[0]), jnp.where(higher, chosen, best[1])), None
+
+    count = -(-n // rows)
+    more = count * rows - n
+    tiles = (
+        jnp.pad(x, ((0, more), (0, 0))).reshape(count, rows, -1),
+        jnp.pad(valid, (0, more)).reshape(count, rows),
+        rows * jnp.arange(count, dtype=jnp.int32),
+    )
+    lowest = jnp.full(kernel.shape[1], -jnp.inf, x.dtype), jnp.zeros(kernel.shape[1], jnp.int32)
+    return lax.scan(merge, lowest, tiles)[0]
+
+
+def _backward(groups, rows, residuals, gradient):
     layer, x, valid, (mean, covariance, channel_mean), norm, normal, chosen = residuals
     count = jnp.maximum(jnp.sum(valid), 1)
     shift = jnp.where(normal * layer.scale + layer.shift > 0, gradient, 0)

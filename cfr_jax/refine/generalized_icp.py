@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from cfr_jax.geometry import rigid
-from cfr_jax.geometry.neighbors import closest
+from cfr_jax.geometry.closest import closest
 from cfr_jax.refine.surfaces import Fit, Surface
 
 _HIGHEST = lax.Precision.HIGHEST

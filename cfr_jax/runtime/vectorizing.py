@@ -15,9 +15,13 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 
-def cloud_by_cloud(function: Callable) -> Callable:
-    """`function`, arrays in and arrays out, such that `vmap` maps it in turn on CPUs."""
-    mapped = custom_vmap(function)
+def cloud_by_cloud(on_cpu: Callable, elsewhere: Callable) -> Callable:
+    """One function, arrays in and arrays out, such that `vmap` maps it in turn on CPUs; two ways to
+    the same result, for CPUs and for the rest."""
+
+    @custom_vmap
+    def mapped(*arguments):
+        return lax.platform_dependent(*arguments, cpu=on_cpu, default=elsewhere)
 
     @mapped.def_vmap
     def batch(size, batched, *arguments):
@@ -29,12 +33,12 @@ def cloud_by_cloud(function: Callable) -> Callable:
             def one(own):
                 own = iter(own)
                 every = [next(own) if b else leaf for leaf, b in zip(leaves, flags, strict=True)]
-                return function(*jax.tree.unflatten(structure, every))
+                return on_cpu(*jax.tree.unflatten(structure, every))
 
             return lax.map(one, [leaf for leaf, b in zip(leaves, flags, strict=True) if b])
 
         def side_by_side(*leaves):
-            return jax.vmap(function, in_axes=axes)(*jax.tree.unflatten(structure, leaves))
+            return jax.vmap(elsewhere, in_axes=axes)(*jax.tree.unflatten(structure, leaves))
 
         found = lax.platform_dependent(*leaves, cpu=in_turn, default=side_by_side)
         return found, jax.tree.map(lambda _: True, found)

@@ -1,16 +1,30 @@
-"""Both searches give the sets of the plain one, ties and duplicates included."""
+"""All searches give the sets of the plain one, ties and duplicates included."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracle import cfr, pieces
-from scipy.spatial import cKDTree
 
 from cfr_jax.geometry import neighbors
-from cfr_jax.geometry.neighbors import closest, nearest, nearest_on_host
+from cfr_jax.geometry.neighbors import first_in_ball, nearest, nearest_on_host
 
-on_device = jax.jit(nearest, static_argnames=("k", "radius"))
+# how CPUs search, and how accelerators do: sorting all, sorting groups, several blocks of those
+SIZES = {"all": {"few": 200}, "groups": {"few": 8}, "blocks": {"few": 8, "entries": 5000}}
+
+
+def searches(on_cpu, elsewhere):
+    """Both kinds, (points, mask, k, radius) in."""
+    made = {"bits": on_cpu} | {
+        name: functools.partial(elsewhere, **sizes) for name, sizes in SIZES.items()
+    }
+    return {name: jax.jit(search, static_argnums=(2, 3)) for name, search in made.items()}
+
+
+NEAREST = searches(neighbors._nearest_by_bits, neighbors._nearest_by_groups)
+IN_BALL = searches(neighbors._first_by_bits, neighbors._first_by_groups)
 
 
 def lattice(rng):
@@ -35,61 +49,90 @@ def on_host(request, monkeypatch):
     return nearest_on_host
 
 
+@pytest.fixture(params=NEAREST)
+def on_device(request):
+    """The device's search, of CPUs and of accelerators."""
+
+    def search(points, k, radius=np.inf, mask=None):
+        mask = None if mask is None else jnp.asarray(mask)
+        return NEAREST[request.param](jnp.asarray(points), mask, k, radius * radius)
+
+    return search
+
+
 def sets(rows):
     return np.sort(np.asarray(rows), axis=1)
 
 
 @pytest.mark.parametrize("k", [1, 12, 124])
 @pytest.mark.parametrize("name", CLOUDS)
-def test_device_and_host_find_the_sets_of_the_plain_search(name, k, on_host):
+def test_the_device_finds_the_sets_of_the_plain_search(name, k, on_device):
     points = CLOUDS[name](np.random.default_rng(0)).astype(np.float32)
 
-    device, host = on_device(jnp.asarray(points), k), on_host(points, k)
-
-    wanted = sets(pieces.nearest_neighbors(points, k))
-    np.testing.assert_array_equal(sets(device), wanted)
-    np.testing.assert_array_equal(sets(host), wanted)
-
-
-@pytest.mark.parametrize("name", ["random", "lattice", "duplicates"])
-def test_neighbors_beyond_the_radius_become_the_nearest(name, on_host):
-    points = CLOUDS[name](np.random.default_rng(1)).astype(np.float32)
-    points[7] += 4  # all alone: its nearest stays
-
-    device = on_device(jnp.asarray(points), 20, radius=0.3)
-    host = on_host(points, 20, radius=0.3)
-
-    wanted = sets(cfr.find_neighbors(points, 20, 0.3))
-    assert len(set(wanted[7])) == 1 and (wanted != sets(pieces.nearest_neighbors(points, 20))).any()
-    np.testing.assert_array_equal(sets(device), wanted)
-    np.testing.assert_array_equal(sets(host), wanted)
-
-
-def test_blocks_of_rows_join_without_a_seam():
-    points = np.random.default_rng(2).normal(size=(700, 3)).astype(np.float32)  # 7 blocks and a bit
-
     np.testing.assert_array_equal(
-        sets(on_device(jnp.asarray(points), 5)), sets(pieces.nearest_neighbors(points, 5))
+        sets(on_device(points, k)), sets(pieces.nearest_neighbors(points, k))
     )
 
 
-def test_masked_points_are_nobodys_neighbor():
+@pytest.mark.parametrize("k", [1, 12, 124])
+@pytest.mark.parametrize("name", CLOUDS)
+def test_the_host_finds_the_sets_of_the_plain_search(name, k, on_host):
+    points = CLOUDS[name](np.random.default_rng(0)).astype(np.float32)
+
+    np.testing.assert_array_equal(
+        sets(on_host(points, k)), sets(pieces.nearest_neighbors(points, k))
+    )
+
+
+def one_alone(name):
+    """A cloud whose point 7 is far from all others, and its neighbors within 0.3."""
+    points = CLOUDS[name](np.random.default_rng(1)).astype(np.float32)
+    points[7] += 4
+    wanted = sets(cfr.find_neighbors(points, 20, 0.3))
+    # its nearest stays, and other points lose some of theirs
+    assert len(set(wanted[7])) == 1 and (wanted != sets(pieces.nearest_neighbors(points, 20))).any()
+    return points, wanted
+
+
+@pytest.mark.parametrize("name", ["random", "lattice", "duplicates"])
+def test_on_the_device_neighbors_beyond_the_radius_become_the_nearest(name, on_device):
+    points, wanted = one_alone(name)
+
+    np.testing.assert_array_equal(sets(on_device(points, 20, radius=0.3)), wanted)
+
+
+@pytest.mark.parametrize("name", ["random", "lattice", "duplicates"])
+def test_on_the_host_neighbors_beyond_the_radius_become_the_nearest(name, on_host):
+    points, wanted = one_alone(name)
+
+    np.testing.assert_array_equal(sets(on_host(points, 20, radius=0.3)), wanted)
+
+
+def test_blocks_of_rows_join_without_a_seam(on_device):
+    points = np.random.default_rng(2).normal(size=(700, 3)).astype(np.float32)  # 7 blocks and a bit
+
+    np.testing.assert_array_equal(
+        sets(on_device(points, 5)), sets(pieces.nearest_neighbors(points, 5))
+    )
+
+
+def test_masked_points_are_nobodys_neighbor(on_device):
     rng = np.random.default_rng(3)
     points = rng.normal(size=(125, 3)).astype(np.float32)
     mask = rng.random(125) < 0.6
 
-    found = on_device(jnp.asarray(points), 12, mask=jnp.asarray(mask))
+    found = on_device(points, 12, mask=mask)
 
     valid = np.flatnonzero(mask)
     wanted = valid[pieces.nearest_neighbors(points[mask], 12)]
     np.testing.assert_array_equal(sets(found)[mask], sets(wanted))
 
 
-def test_too_few_valid_points_repeat_their_nearest():
+def test_too_few_valid_points_repeat_their_nearest(on_device):
     points = np.random.default_rng(4).normal(size=(125, 3)).astype(np.float32)
     mask = np.arange(125) < 4
 
-    found = np.asarray(on_device(jnp.asarray(points), 12, mask=jnp.asarray(mask)))
+    found = np.asarray(on_device(points, 12, mask=mask))
 
     first = pieces.nearest_neighbors(points[:4], 1)[:, 0]
     for row in range(4):
@@ -117,16 +160,30 @@ def test_an_impossible_k_is_refused(k):
         nearest_on_host(points, k)
 
 
-@pytest.mark.parametrize("masked", [False, True])
-def test_the_closest_point_is_that_of_a_search_through_all(masked):
-    rng = np.random.default_rng(6)
-    queries, points = (rng.normal(size=(n, 3)).astype(np.float32) for n in (1100, 1000))
-    mask = rng.random(1000) < 0.5 if masked else np.ones(1000, bool)
+@pytest.mark.parametrize("search", IN_BALL)
+@pytest.mark.parametrize("k", [1, 12, 200])
+@pytest.mark.parametrize("name", CLOUDS)
+def test_balls_hold_their_first_points_by_index(name, k, search):
+    rng = np.random.default_rng(7)
+    points, mask = CLOUDS[name](rng).astype(np.float32), rng.random(125) < 0.7
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    radius = float(np.median(distance)) / 2 + 1e-3  # on no distance of the lattice
 
-    found = jax.jit(closest)(
-        jnp.asarray(queries), jnp.asarray(points), jnp.asarray(mask) if masked else None
-    )
+    found = IN_BALL[search](jnp.asarray(points), jnp.asarray(mask), k, radius)
 
-    distance, index = cKDTree(points[mask]).query(queries)
-    np.testing.assert_array_equal(found.index, np.flatnonzero(mask)[index])
-    np.testing.assert_allclose(found.square, distance**2, rtol=1e-5)
+    inside = (distance <= radius) & mask & ~np.eye(125, dtype=bool)
+    for row, ball in enumerate(inside):
+        wanted = np.flatnonzero(ball)[:k]
+        np.testing.assert_array_equal(found[row], [*wanted, *[row] * (k - len(wanted))])
+
+
+@pytest.mark.parametrize(("platform", "most"), [("cuda", 0), ("tpu", 0), ("cpu", 2)])
+def test_an_accelerator_searches_without_a_loop(platform, most):
+    points = jax.ShapeDtypeStruct((4000, 3), jnp.float32)
+
+    for search in (lambda x: nearest(x, 64), lambda x: first_in_ball(x, 64, 0.3)):
+        batched = jax.vmap(search)
+        for program, given in ((search, points), (batched, points.update(shape=(2, 4000, 3)))):
+            text = jax.jit(program).trace(given).lower(lowering_platforms=(platform,)).as_text()
+            loops = text.count("stablehlo.while")
+            assert loops == 0 if most == 0 else 0 < loops <= most

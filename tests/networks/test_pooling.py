@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cfr_jax.networks import pooling
 from cfr_jax.networks.layers import Layer, group_norm
 from cfr_jax.networks.pooling import pooled_layer
 
@@ -27,14 +26,13 @@ def plain(layer, x):
 
 @pytest.mark.parametrize("rows", [N, 5], ids=["one tile", "three tiles"])
 @pytest.mark.parametrize("mask", [None, MASK], ids=["all", "masked"])
-def test_values_and_gradients_are_those_of_the_plain_form(x64, monkeypatch, mask, rows):
-    monkeypatch.setattr(pooling, "_TILE_ROWS", rows)
+def test_values_and_gradients_are_those_of_the_plain_form(x64, mask, rows):
     layer, x = given()
     valid = slice(None) if mask is None else mask
     pull = jnp.asarray(np.random.default_rng(1).normal(size=WIDTH))
 
     def found(layer, x):
-        pooled = pooled_layer(layer, x, groups=GROUPS, mask=mask)
+        pooled = pooled_layer(layer, x, groups=GROUPS, mask=mask, on_cpu=rows)
         return jnp.sum(pooled * pull), pooled
 
     def wanted(layer, x):
@@ -61,6 +59,16 @@ def test_gradients_are_finite_whatever_comes_in(scale, valid):
     gradients = slope(layer, x * scale, jnp.arange(N) < valid)
 
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+
+
+def test_an_accelerator_takes_a_large_pair_in_one_step():
+    layer, x = given(np.float32)
+    rows = jax.ShapeDtypeStruct((24_000, INPUTS), x.dtype)
+    traced = slope.trace(layer, rows, jax.ShapeDtypeStruct((24_000,), bool))
+
+    for platform in ("cpu", "cuda", "tpu"):
+        text = traced.lower(lowering_platforms=(platform,)).as_text()
+        assert ("stablehlo.while" in text) == (platform == "cpu")
 
 
 def test_memory_for_the_wide_layer_does_not_grow_with_the_clouds():

@@ -1,19 +1,24 @@
 """Every form of the match against the reference, over all the annealing a network may ask for."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 from oracle import pieces
 
 from cfr_jax.networks.sinkhorn import FORMS, Affinity, form_for, match
-from cfr_jax.networks.sinkhorn.streamed import match_streamed
+from cfr_jax.networks.sinkhorn.by_hand import Way, match_by_hand
 
 N, M = 13, 15
-# three blocks of five rows, the last of them padded
-FORMS = {**FORMS, "streamed": functools.partial(match_streamed, rows=5)}
+# three blocks of five rows, the last of them padded; and what accelerators do
+WAYS = {"streamed": Way("streamed", 5), "stored": Way("stored", 0), "fused": Way("fused", 8)}
+FORMS |= {
+    name: functools.partial(match_by_hand, on_cpu=way, elsewhere=way) for name, way in WAYS.items()
+}
 # beta, alpha: diffuse, as trained, far beyond where exp(alpha beta) overflows, nothing in reach
 ANNEALING = [(1e-3, 1e-3), (12.0, 0.3), (60.0, 1.0), (100.0, 2.0), (200.0, 4.0), (1e4, 1.0),
              (1e4, 0.01), (300.0, 0.0), (2.0, 50.0)]  # fmt: skip
@@ -157,35 +162,38 @@ def test_gradients_are_their_finite_differences(x64, form, passes, beta, alpha):
         np.testing.assert_allclose(derivative, (ahead - behind) / 2, rtol=1e-5, atol=1e-12)
 
 
-def assert_same_slope(dtype, beta, alpha, atol):
+def assert_same_slope(form, dtype, beta, alpha, atol):
     at = *affinity(beta, alpha, dtype), jnp.asarray(HERE), jnp.asarray(THERE)
 
-    found, wanted = (jax.tree.leaves(slope(form)(*at)) for form in ("streamed", "dense"))
+    found, wanted = (jax.tree.leaves(slope(each)(*at)) for each in (form, "dense"))
 
     for part, expected in zip(found, wanted, strict=True):
         size = max(1, float(jnp.abs(expected).max()))
         np.testing.assert_allclose(part / size, expected / size, atol=atol, rtol=0)
 
 
+@pytest.mark.parametrize("form", WAYS)
 @pytest.mark.parametrize(("beta", "alpha"), ANNEALING)
-def test_streamed_and_dense_have_the_same_value_and_gradient(x64, beta, alpha):
-    assert_same_slope(np.float64, beta, alpha, atol=1e-9)
+def test_the_gradient_by_hand_is_that_of_the_dense_form(x64, form, beta, alpha):
+    assert_same_slope(form, np.float64, beta, alpha, atol=1e-9)
 
 
-def test_streamed_and_dense_have_the_same_value_and_gradient_in_single_precision():
+@pytest.mark.parametrize("form", WAYS)
+def test_the_gradient_by_hand_is_that_of_the_dense_form_in_single_precision(form):
     # at sharper annealing float32 parts each of them from the truth by more than this, equally
-    assert_same_slope(np.float32, 12.0, 0.3, atol=1e-5)
+    assert_same_slope(form, np.float32, 12.0, 0.3, atol=1e-5)
 
 
-def test_a_batch_is_streamed_like_its_pairs():
+@pytest.mark.parametrize("form", WAYS)
+def test_a_batch_is_matched_like_its_pairs(form):
     pairs = [affinity(12.0, 0.3, seed=seed) for seed in (0, 1)]
     batch = jax.tree.map(lambda *parts: jnp.stack(parts), *pairs)
     masks = jnp.asarray(HERE), jnp.asarray(THERE)
 
-    _, together = jax.jit(jax.vmap(slope("streamed"), (0, 0, None, None)))(*batch, *masks)
+    _, together = jax.jit(jax.vmap(slope(form), (0, 0, None, None)))(*batch, *masks)
 
     for i, pair in enumerate(pairs):
-        alone = slope("streamed")(*pair, *masks)[1]
+        alone = slope(form)(*pair, *masks)[1]
         for batched, single in zip(*map(jax.tree.leaves, (together, alone)), strict=True):
             np.testing.assert_allclose(batched[i], single, rtol=1e-4, atol=1e-5)
 
@@ -199,7 +207,8 @@ def test_memory_of_the_streamed_match_grows_with_the_clouds_and_not_with_their_p
         points = jax.ShapeDtypeStruct((n, 3), jnp.float32)
 
         def run(given, points):
-            found = match_streamed(given, points, passes=3, rows=16)
+            way = Way("streamed", 16)
+            found = match_by_hand(given, points, passes=3, on_cpu=way, elsewhere=way)
             return jnp.sum(found.targets) + jnp.sum(found.covered)
 
         program = jax.jit(jax.grad(run) if differentiated else run)
@@ -219,8 +228,47 @@ def test_large_blocks_are_streamed_and_small_ones_may_be():
 
     for part, expected in zip(found, wanted, strict=True):
         np.testing.assert_allclose(part, expected, atol=1e-5)
-    assert form_for(5000, 5000) == "dense" and form_for(12_000, 12_000) == "streamed"
-    assert form_for(100, 100_000) == "dense"
+    assert form_for(5000, 5000, "cpu") == "dense" and form_for(12_000, 12_000, "cpu") == "streamed"
+    assert form_for(100, 100_000, "cpu") == "dense"
+    assert form_for(12_000, 12_000, "accelerator") == "dense"
+    assert form_for(30_000, 30_000, "accelerator") == "streamed"
+
+
+@pytest.mark.parametrize(("n", "stored"), [(6000, True), (12_000, True), (30_000, False)])
+def test_an_accelerator_stores_what_a_cpu_streams(n, stored):
+    shapes = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in [(n, 96), (n, 96), (), ()])
+    given, points = Affinity(*shapes), jax.ShapeDtypeStruct((n, 3), jnp.float32)
+
+    def total(given, points):
+        return jnp.sum(match(given, points, passes=3).targets)
+
+    for function in (total, jax.grad(total, (0, 1))):
+        traced = jax.jit(function).trace(given, points)
+        for platform in ("cpu", "cuda", "tpu"):
+            text = traced.lower(lowering_platforms=(platform,)).as_text()
+            assert ("stablehlo.while" in text) == (platform == "cpu" or not stored)
+            assert (f"tensor<{n}x{n}xf32>" in text) == (platform != "cpu" and stored)
+
+
+@pytest.mark.parametrize("differentiated", [False, True])
+@pytest.mark.filterwarnings("ignore:.*Pallas Triton backend is deprecated:DeprecationWarning")
+def test_fused_becomes_kernels_on_a_gpu_and_stores_no_block(differentiated):
+    n, m = 700, 800
+    shapes = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in [(n, 96), (m, 96), (), ()])
+    points = jax.ShapeDtypeStruct((m, 3), jnp.float32)
+
+    def total(given, points):
+        return jnp.sum(match(given, points, passes=2, form="fused").targets)
+
+    program = jax.jit(jax.grad(total) if differentiated else total)
+    gpu = AbstractMesh((), (), abstract_device=AbstractDevice("NVIDIA H100", 132, "gpu"))
+    with use_abstract_mesh(gpu):
+        lowered = program.trace(Affinity(*shapes), points).lower(lowering_platforms=("cuda",))
+
+    text = lowered.as_text()
+    # the largest; two passes of two kernels each; the targets; backwards as many, and the features
+    assert text.count("@__gpu$xla.gpu.triton") == 1 + 4 + 1 + (1 + 3 + 2 if differentiated else 0)
+    assert not re.search(r"tensor<7\d\dx8\d\dx", text)
 
 
 @pytest.mark.parametrize("form", FORMS)

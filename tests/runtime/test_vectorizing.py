@@ -15,6 +15,11 @@ def parts(weights, rows):
     return jnp.tanh(rows @ weights["kernel"]), (weights["shift"] + rows.sum(0),)
 
 
+def other(weights, rows):
+    """The same, less exactly."""
+    return jax.tree.map(lambda part: part + 0.5, parts(weights, rows))
+
+
 WEIGHTS = {"kernel": jnp.arange(12.0).reshape(3, 4) / 12, "shift": jnp.array([1.0, 2.0, 3.0])}
 ROWS = jnp.asarray(np.random.default_rng(0).normal(size=(5, 6, 3)), jnp.float32)
 
@@ -26,7 +31,7 @@ def test_a_batch_in_turn_is_a_batch(axes):
     if axes[0] is not None:
         weights["shift"] = jnp.stack([WEIGHTS["shift"] * i for i in range(5)])
 
-    found = jax.vmap(cloud_by_cloud(parts), axes)(weights, rows)
+    found = jax.vmap(cloud_by_cloud(parts, other), axes)(weights, rows)
 
     wanted = jax.vmap(parts, axes)(weights, rows)
     assert jax.tree.structure(found) == jax.tree.structure(wanted)
@@ -34,8 +39,18 @@ def test_a_batch_in_turn_is_a_batch(axes):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7)  # of entries of order one
 
 
+def test_each_platform_has_its_own_way():
+    one = jax.jit(cloud_by_cloud(parts, other)).trace(WEIGHTS, ROWS[0])
+    batch = jax.jit(jax.vmap(cloud_by_cloud(parts, other), (None, 0))).trace(WEIGHTS, ROWS)
+
+    for program in (one, batch):
+        for platform in ("cpu", "cuda", "tpu"):
+            text = program.lower(lowering_platforms=(platform,)).as_text()
+            assert ("5.000000e-01" in text) == (platform != "cpu")
+
+
 def test_only_a_cpu_takes_a_batch_in_turn():
-    batch = jax.jit(jax.vmap(cloud_by_cloud(parts), (None, 0)))
+    batch = jax.jit(jax.vmap(cloud_by_cloud(parts, parts), (None, 0)))
 
     def loops(platform):
         lowered = batch.trace(WEIGHTS, ROWS).lower(lowering_platforms=(platform,))

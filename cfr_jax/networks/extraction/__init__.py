@@ -2,12 +2,13 @@
 
 Three layers of Linear, GroupNorm and ReLU see n k rows per cloud, and the norm's statistics run
 over all of them, so the plain form writes and reads n k 96 floats eight times, and four times that
-for its gradient. Here tiles of points stay in a cache, and at most one such array is ever stored.
+for its gradient. Here tiles of points stay in a CPU's cache, and at most one such array is ever
+stored; to an accelerator the whole cloud is one tile.
 
 - The first layer's statistics follow exactly from the mean and covariance of the seven raw
   channels.
 - One pass over the tiles sums the second layer's output for its statistics, and keeps it, as far as
-  `tiles.KEPT` allows; beyond, it is made again when it is needed.
+  the limits allow; beyond, it is made again when it is needed.
 - A second pass sums the third layer's output and keeps its largest value over the neighbors. The
   norm and the ReLU are monotonic per channel, so the pooled feature is that value, normalized.
   (Where the norm's scale is negative it is the smallest value: the sign is folded into the
@@ -30,6 +31,7 @@ from jaxtyping import Array, Bool, Float
 from cfr_jax.networks.extraction.backward import backward
 from cfr_jax.networks.extraction.forward import forward
 from cfr_jax.networks.extraction.mixed import pooled_mixed
+from cfr_jax.networks.extraction.tiles import ACCELERATOR, CPU, Limits, kept_of, tiling_of
 from cfr_jax.networks.layers import Layer
 from cfr_jax.runtime.vectorizing import cloud_by_cloud
 
@@ -39,7 +41,7 @@ __all__ = ["Activations", "pooled_features"]
 Activations = Literal["float32", "bfloat16"]
 
 
-@functools.partial(jax.jit, static_argnames=("groups", "activations"))
+@functools.partial(jax.jit, static_argnames=("groups", "activations", "on_cpu", "elsewhere"))
 def pooled_features(
     layers: tuple[Layer, Layer, Layer],
     raw: Float[Array, "n k c"],
@@ -47,13 +49,16 @@ def pooled_features(
     groups: int,
     mask: Bool[Array, " n"] | None = None,
     activations: Activations = "float32",
+    on_cpu: Limits = CPU,
+    elsewhere: Limits = ACCELERATOR,
 ) -> Float[Array, "n d"]:
     """Per-neighbor MLP and maximum over the neighbors, one feature per point.
 
     Rows of masked points enter no statistic; their own features are zero. Differentiates by its own
-    rule, once, with memory for one activation (at most `tiles.KEPT` numbers of it) and its
-    gradient. `activations` says what the values between the layers are rounded to and multiplied
-    in: for "bfloat16" see `mixed`.
+    rule, once, with memory for one activation (at most `on_cpu.kept` numbers of it) and its
+    gradient. The platform that the program is lowered for decides between the limits. `activations`
+    says what the values between the layers are rounded to and multiplied in: for "bfloat16" see
+    `mixed`.
     """
     n = raw.shape[0]
     valid = jnp.ones(n, raw.dtype) if mask is None else mask.astype(raw.dtype)
@@ -61,21 +66,28 @@ def pooled_features(
         raise ValueError(f"activations: got {activations!r}, wanted 'float32' or 'bfloat16'")
     if activations == "bfloat16":
         return pooled_mixed(layers, raw, valid, groups) * valid[:, None]
-    return _pooled(layers, raw, valid, groups) * valid[:, None]
+    return _pooled(layers, raw, valid, groups, (on_cpu, elsewhere)) * valid[:, None]
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _pooled(layers, raw, valid, groups):
-    return _pooled_fwd(layers, raw, valid, groups)[0]
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _pooled(layers, raw, valid, groups, limits):
+    return _pooled_fwd(layers, raw, valid, groups, limits)[0]
 
 
-def _pooled_fwd(layers, raw, valid, groups):
-    pooled, kept = cloud_by_cloud(functools.partial(forward, groups=groups))(layers, raw, valid)
+def _pooled_fwd(layers, raw, valid, groups, limits):
+    n, k, _ = raw.shape
+    # as many rows on every platform, since it is one program until it is lowered
+    tiling = tiling_of(n, k, limits[0])
+    rows_kept = kept_of(tiling, k, layers[1].bias.size, limits[0]) * tiling.size * k
+    ways = (functools.partial(forward, groups=groups, limits=one, rows_kept=rows_kept)
+            for one in limits)  # fmt: skip
+    pooled, kept = cloud_by_cloud(*ways)(layers, raw, valid)
     return pooled, (layers, raw, valid, kept)
 
 
-def _pooled_bwd(groups, residuals, gradient):
-    return cloud_by_cloud(functools.partial(backward, groups=groups))(*residuals, gradient)
+def _pooled_bwd(groups, limits, residuals, gradient):
+    ways = (functools.partial(backward, groups=groups, limits=one) for one in limits)
+    return cloud_by_cloud(*ways)(*residuals, gradient)
 
 
 _pooled.defvjp(_pooled_fwd, _pooled_bwd)

@@ -8,7 +8,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from cfr_jax.networks.extraction.forward import Kept
-from cfr_jax.networks.extraction.tiles import count_of, cut, cut_rows, scan
+from cfr_jax.networks.extraction.tiles import Limits, cut, cut_rows, scan, tiling_of
 from cfr_jax.networks.layers import Layer, fold, projections
 
 _HIGHEST = lax.Precision.HIGHEST  # for the raw channels, as forward
@@ -22,15 +22,19 @@ def backward(
     gradient: Float[Array, "n d"],
     *,
     groups: int,
+    limits: Limits,
 ) -> tuple[tuple[Layer, Layer, Layer], Float[Array, "n k c"], Float[Array, " n"]]:
     """Gradients of the layers, of the raw channels, and none (zeros) of `valid`."""
     one, two, three = layers
     (norm_one, norm_two, norm_three), normal, second = kept
     n, k, channels = raw.shape
     width = three.bias.size
-    count = count_of(n, k)
-    tiles = cut_rows(raw, count)
-    weights = jnp.repeat(cut(valid, count), k, axis=1)
+    tiling = tiling_of(n, k, limits)
+    tiles = cut_rows(raw, tiling)
+    weights = jnp.repeat(cut(valid, tiling), k, axis=1)
+    # what was kept serves where it fills whole tiles
+    some = min(tiling.count, len(second) // tiles.shape[1])
+    second = second[: some * tiles.shape[1]].reshape(some, tiles.shape[1], two.bias.size)
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
     kernel_first, bias_first = fold(one, norm_one)
 
@@ -50,7 +54,7 @@ def backward(
     shift_three, scale_three = gradient.sum(0), (gradient * normal).sum(0)
     flat_three, tilt_three = projections(three, shift_three, scale_three, rows, groups)
     at_extreme = gradient * three.scale * norm_three.rate
-    at_extreme = cut(at_extreme, count)
+    at_extreme = cut(at_extreme, tiling)
 
     def through_three(sums, z_two, raw, weight, incoming):
         n_two = normal_two(z_two)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from cfr_jax.networks.extraction.tiles import count_of, cut, cut_rows, kept_of, scan
+from cfr_jax.networks.extraction.tiles import Limits, cut, cut_rows, each, kept_of, scan, tiling_of
 from cfr_jax.networks.layers import Layer, Norm, fold, norm_of
 
 _HIGHEST = lax.Precision.HIGHEST  # for what becomes a variance
@@ -21,8 +21,8 @@ class Kept(NamedTuple):
     norms: tuple[Norm, Norm, Norm]
     normal: Float[Array, "n d"]
     """The pooled values, normalized, before scale and shift."""
-    second: Float[Array, "some rows d"]
-    """The second layer's output, bias left out, of the tiles that are kept."""
+    second: Float[Array, "rows d"]
+    """The second layer's output, bias left out, of the first so many rows."""
 
 
 def forward(
@@ -31,34 +31,43 @@ def forward(
     valid: Float[Array, " n"],
     *,
     groups: int,
+    limits: Limits,
+    rows_kept: int,
 ) -> tuple[Float[Array, "n d"], Kept]:
-    """The pooled features, and what is kept for the gradient; all zero where no point is valid."""
-
-    n, k, _ = raw.shape
+    """The pooled features, and what is kept for the gradient, of the second layer's output
+    `rows_kept` rows; all of it finite, whatever is valid."""
+    n = raw.shape[0]
     widths = [layer.bias.size for layer in layers]
-    tiles = cut_rows(raw, count_of(n, k))
 
     def of_points():
-        return _forward(layers, raw, tiles, valid, groups)
+        pooled, kept = _forward(layers, raw, valid, groups, limits)
+        second = kept.second.reshape(-1, widths[1])[:rows_kept]
+        more = rows_kept - len(second)  # where another platform's tiles hold more padding
+        return pooled, kept._replace(second=jnp.pad(second, ((0, more), (0, 0))))
 
     def of_none():
         norms = tuple(Norm(*2 * (jnp.zeros(width, raw.dtype),)) for width in widths)
         pooled = jnp.zeros((n, widths[-1]), raw.dtype)
-        kept = jnp.zeros((kept_of(tiles, widths[1]), tiles.shape[1], widths[1]), raw.dtype)
-        return pooled, Kept(norms, pooled, kept)
+        return pooled, Kept(norms, pooled, jnp.zeros((rows_kept, widths[1]), raw.dtype))
 
-    # To XLA's scheduler a branch is one operation: so the clouds of a pair come one after the other
-    # and take the same scratch. (The barrier hides from it that without a mask all are valid.)
+    if limits.at_once > 1:
+        return of_points()  # an accelerator would have to ask the host which branch to take
+
+    # To XLA's scheduler a branch is one operation: so on a CPU the clouds of a pair come one after
+    # the other and take the same scratch. (The barrier hides from it that without a mask all are
+    # valid.)
     some = jnp.any(lax.optimization_barrier(valid) > 0)
     return lax.cond(some, of_points, of_none)
 
 
-def _forward(layers, raw, tiles, valid, groups):
+def _forward(layers, raw, valid, groups, limits):
     one, two, three = layers
     n, k, _ = raw.shape
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
+    tiling = tiling_of(n, k, limits)
+    tiles = cut_rows(raw, tiling)
 
-    norm_one = norm_of(*_moments_of_first(one, tiles, valid, rows), groups)
+    norm_one = norm_of(*_moments_of_first(one, tiles, cut(valid, tiling), rows), groups)
     kernel_one, bias_one = fold(one, norm_one)
 
     def second(raw):
@@ -70,8 +79,8 @@ def _forward(layers, raw, tiles, valid, groups):
         z = second(raw)
         return None, (z, _sums_of_neighbors(z, k))
 
-    some = kept_of(tiles, two.bias.size)
-    _, (kept, sums) = lax.scan(statistics, None, tiles[:some])
+    some = kept_of(tiling, k, two.bias.size, limits)
+    _, (kept, sums) = each(statistics, None, tiles[:some])
     if some < len(tiles):
         more = lax.map(lambda raw: statistics(None, raw)[1][1], tiles[some:])
         sums = jax.tree.map(lambda *parts: jnp.concatenate(parts), sums, more)
@@ -96,28 +105,27 @@ def _forward(layers, raw, tiles, valid, groups):
 
 
 def _sums_of_neighbors(z, k):
-    each = z.reshape(-1, k, z.shape[-1])
-    return each.sum(1), (each * each).sum(1)
+    z = z.reshape(-1, k, z.shape[-1])
+    return z.sum(1), (z * z).sum(1)
 
 
 def _moments(sums, valid, rows, bias, sign=1):
     """Mean and variance of a layer's output from each point's sums over its neighbors."""
-    total, square = (valid @ each.reshape(-1, bias.size)[: valid.size] / rows for each in sums)
+    total, square = (valid @ sum_.reshape(-1, bias.size)[: valid.size] / rows for sum_ in sums)
     return total * sign + bias, square - total * total
 
 
-def _moments_of_first(layer, tiles, valid, rows):
+def _moments_of_first(layer, tiles, weights, rows):
     # tile by tile: on CPU the product copies what it is made of
-    count, _, channels = tiles.shape
-    weights = cut(valid, count)
-    each = tiles.reshape(*weights.shape, -1, channels)
-    mean = jnp.sum(weights[:, :, None, None] * each, (0, 1, 2)) / rows
+    channels = tiles.shape[-1]
+    neighbors = tiles.reshape(*weights.shape, -1, channels)
+    mean = jnp.sum(weights[:, :, None, None] * neighbors, (0, 1, 2)) / rows
 
     def add(gram, tile):
         raw, weight = tile
         centered = ((raw - mean) * weight[:, None, None]).reshape(-1, channels)
         return gram + jnp.matmul(centered.T, centered, precision=_HIGHEST), None
 
-    gram, _ = lax.scan(add, jnp.zeros((channels, channels), tiles.dtype), (each, weights))
+    gram, _ = each(add, jnp.zeros((channels, channels), tiles.dtype), (neighbors, weights))
     covariance = gram / rows
     return mean @ layer.kernel + layer.bias, ((covariance @ layer.kernel) * layer.kernel).sum(0)

@@ -1,46 +1,66 @@
-"""Tiles of rows that stay in a cache, and what is kept of them between two passes."""
+"""Tiles of rows, as many at a time as a platform likes, and what is kept between two passes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-# Rows of 96 floats in flight, so that a tile's activations stay in a cache: two or three of them at
-# a time forward, about eight backward.
-ROWS = 4096
-# Numbers of the second layer's output that are kept, 18 MiB. Made again they cost half of what the
-# rest of the forward pass does; but a program with more than 32 MiB of scratch is given it anew in
-# each call, page by page (glibc), which costs more than is saved.
-KEPT = 9 << 19
+
+class Limits(NamedTuple):
+    """How large a step is, and how much is kept."""
+
+    rows: int = 4096
+    """Of a tile, neighbor by neighbor. On a CPU a tile's activations stay in a cache: rows of 96
+    floats, two or three of them at a time forward, about eight backward."""
+    kept: int = 9 << 19
+    """Numbers of the second layer's output that are kept, 18 MiB. Made again they cost half of what
+    the rest of the forward pass does; but a program with more than 32 MiB of scratch is given it
+    anew in each call, page by page (glibc), which costs more than is saved."""
+    at_once: int = 1
+    """Tiles that are one step. An accelerator wants the whole cloud in one: steps of a loop are
+    kernels that each have too little to do."""
 
 
-def count_of(n: int, k: int) -> int:
-    """Tiles for n points with k neighbors."""
-    return -(-n * k // ROWS)
+CPU = Limits()
+# 2 million rows: 32,000 points with 64 neighbors, 0.8 GiB an activation; 2 GiB are kept
+ACCELERATOR = Limits(kept=1 << 29, at_once=512)
 
 
-def cut(values: Array, count: int) -> Array:
-    """Points (n, ...) cut into tiles (count, size, ...), padded to whole ones."""
-    n = values.shape[0]
+class Tiling(NamedTuple):
+    """`count` tiles of `size` points each; the last may be padded."""
+
+    count: int
+    size: int
+
+
+def tiling_of(n: int, k: int, limits: Limits) -> Tiling:
+    """The tiles of n points with k neighbors."""
+    count = -(-n * k // limits.rows)
     size = -(-n // count)
-    pad = [(0, count * size - n)] + [(0, 0)] * (values.ndim - 1)
-    return jnp.pad(values, pad).reshape(count, size, *values.shape[1:])
+    together = min(count, limits.at_once)
+    return Tiling(-(-count // together), together * size)
 
 
-def cut_rows(raw: Float[Array, "n k c"], count: int) -> Float[Array, "count rows c"]:
-    """The same, neighbor by neighbor."""
-    return cut(raw, count).reshape(count, -1, raw.shape[-1])
-
-
-def kept_of(tiles: Float[Array, "count rows c"], width: int) -> int:
+def kept_of(tiling: Tiling, k: int, width: int, limits: Limits) -> int:
     """How many of the tiles are kept in a layer of that width."""
-    count, rows, _ = tiles.shape
-    return max(1, min(count, KEPT // (rows * width)))
+    return max(1, min(tiling.count, limits.kept // (tiling.size * k * width)))
+
+
+def cut(values: Array, tiling: Tiling) -> Array:
+    """Points (n, ...) cut into tiles (count, size, ...), padded to whole ones."""
+    more = tiling.count * tiling.size - values.shape[0]
+    padded = jnp.pad(values, [(0, more)] + [(0, 0)] * (values.ndim - 1))
+    return padded.reshape(*tiling, *values.shape[1:])
+
+
+def cut_rows(raw: Float[Array, "n k c"], tiling: Tiling) -> Float[Array, "count rows c"]:
+    """The same, neighbor by neighbor."""
+    return cut(raw, tiling).reshape(tiling.count, -1, raw.shape[-1])
 
 
 def scan(
@@ -55,8 +75,19 @@ def scan(
     output: kept of the first tiles, made `again` from the raw channels of the rest."""
     some = kept.shape[0]
     first, rest = ([x[part] for x in (tiles, *others)] for part in (slice(some), slice(some, None)))
-    state, results = lax.scan(lambda state, x: step(state, *x), state, (kept, *first))
+    results = []
+    if some:
+        state, result = each(lambda state, x: step(state, *x), state, (kept, *first))
+        results.append(result)
     if some < len(tiles):
-        state, more = lax.scan(lambda state, x: step(state, again(x[0]), *x), state, tuple(rest))
-        results = jax.tree.map(lambda *parts: jnp.concatenate(parts), results, more)
-    return state, results
+        state, result = each(lambda state, x: step(state, again(x[0]), *x), state, tuple(rest))
+        results.append(result)
+    return state, jax.tree.map(lambda *parts: jnp.concatenate(parts), *results)
+
+
+def each(step: Callable[[Any, Any], tuple[Any, Any]], state: Any, tiles: Any) -> tuple[Any, Any]:
+    """`lax.scan`, without a loop where there is but one tile."""
+    if len(jax.tree.leaves(tiles)[0]) > 1:
+        return lax.scan(step, state, tiles)
+    state, result = step(state, jax.tree.map(lambda tile: tile[0], tiles))
+    return state, jax.tree.map(lambda tile: tile[None], result)

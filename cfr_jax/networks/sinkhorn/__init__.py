@@ -2,8 +2,9 @@
 
 A row and a column of ones stand beside the affinities m = exp(log affinity) and take what has no
 partner; they are never normalized themselves. One pass divides every real row by its sum, then
-every real column by its sum, slack included. Three forms give the same numbers: `dense` stores the
-(n, m) block, `streamed` never does, `log_space` is the published one that they are compared with.
+every real column by its sum, slack included. Several forms give the same numbers: `dense` stores
+the (n, m) block, `streamed` makes it row by row whenever it needs it, `fused` does so inside a
+GPU's kernel, `log_space` is the published one that they are compared with.
 """
 
 from __future__ import annotations
@@ -13,22 +14,23 @@ from typing import Literal
 from jaxtyping import Array, Bool, Float
 
 from cfr_jax.networks.sinkhorn.affinity import Affinity, Match
+from cfr_jax.networks.sinkhorn.by_hand import Way, match_by_hand
 from cfr_jax.networks.sinkhorn.dense import match_dense
 from cfr_jax.networks.sinkhorn.log_space import match_in_log_space
-from cfr_jax.networks.sinkhorn.streamed import match_streamed
+from cfr_jax.networks.sinkhorn.streamed import rows_of
 
 __all__ = ["FORMS", "Affinity", "Form", "Match", "form_for", "match"]
 
-Form = Literal["auto", "dense", "streamed", "log space"]
-FORMS = {
-    "dense": match_dense,
-    "streamed": match_streamed,
-    "log space": match_in_log_space,
-}
+Form = Literal["auto", "dense", "streamed", "fused", "log space"]
+Platform = Literal["cpu", "accelerator"]
 
-# Entries of a block that is still stored: 128 MiB of float32. Stored, a further pass costs reading
-# the block twice; streamed, making it once more, which is slower, at worst twice as slow.
-_STORED = 1 << 25
+# Entries of a block that is still stored, 128 MiB of float32 on a CPU and 2 GiB on an accelerator.
+# Stored, a further pass costs reading the block twice; streamed, making it once more. That is at
+# worst twice as slow on a CPU; on a GPU it is several times as slow, and many more kernels.
+_STORED: dict[Platform, int] = {"cpu": 1 << 25, "accelerator": 1 << 29}
+# Entries of a block that is streamed, 16 MiB and 256 MiB.
+_STREAMED: dict[Platform, int] = {"cpu": 1 << 22, "accelerator": 1 << 26}
+_TILE = 64  # rows and columns of a kernel's tile
 
 
 def match(
@@ -43,21 +45,55 @@ def match(
     """Normalizes the affinities by `passes` passes and averages `points` with them.
 
     Finite for every finite affinity. Masked points neither give nor take. `passes` and `form` are
-    static; "auto" decides by the number of entries (`form_for`). Differentiates with respect to
-    everything but the masks: once, where streamed. Raises ValueError for fewer than one pass, and
-    for a form that does not exist.
+    static; "auto" decides by the number of entries and the platform that the program is lowered
+    for (`form_for`), of one pair: a batch of large ones is for "streamed". Differentiates with
+    respect to everything but the masks; once, where the form is not "dense" or "log space". Raises
+    ValueError for fewer than one pass, and for a form that does not exist.
     """
     if passes < 1:
         raise ValueError(f"passes: got {passes}, wanted at least 1")
-    if form == "auto":
-        form = form_for(affinity.source.shape[0], affinity.target.shape[0])
-    if form not in FORMS:
+    if form != "auto" and form not in FORMS:
         raise ValueError(f"form: got {form!r}, wanted 'auto' or one of {sorted(FORMS)}")
-    return FORMS[form](
-        affinity, points, passes=passes, source_mask=source_mask, target_mask=target_mask
-    )
+    run = _match_by_size if form == "auto" else FORMS[form]
+    return run(affinity, points, passes=passes, source_mask=source_mask, target_mask=target_mask)
 
 
-def form_for(n: int, m: int) -> Form:
+def form_for(n: int, m: int, platform: Platform) -> Form:
     """The form that "auto" means for n source and m target points."""
-    return "dense" if n * m <= _STORED else "streamed"
+    return "dense" if n * m <= _STORED[platform] else "streamed"
+
+
+def _match_streamed(affinity, points, **rest):
+    return _by_hand(affinity, points, [_streamed(affinity, each) for each in _STREAMED], **rest)
+
+
+def _match_fused(affinity, points, **rest):
+    return _by_hand(affinity, points, 2 * [Way("fused", _TILE)], **rest)
+
+
+def _by_hand(affinity, points, ways, **rest):
+    return match_by_hand(affinity, points, on_cpu=ways[0], elsewhere=ways[1], **rest)
+
+
+def _streamed(affinity, platform):
+    return Way("streamed", rows_of(affinity.target.shape[0], _STREAMED[platform]))
+
+
+def _match_by_size(affinity, points, **rest):
+    sizes = affinity.source.shape[0], affinity.target.shape[0]
+    forms = [form_for(*sizes, platform) for platform in _STORED]
+    if forms[0] == "dense":
+        return match_dense(affinity, points, **rest)
+    ways = [
+        Way("stored", 0) if form == "dense" else _streamed(affinity, platform)
+        for form, platform in zip(forms, _STORED, strict=True)
+    ]
+    return _by_hand(affinity, points, ways, **rest)
+
+
+FORMS = {
+    "dense": match_dense,
+    "streamed": _match_streamed,
+    "fused": _match_fused,
+    "log space": match_in_log_space,
+}

@@ -38,6 +38,19 @@ class Match(NamedTuple):
     """Column sums: how much of each target point was found."""
 
 
+class Trace(NamedTuple):
+    """What the gradients written by hand need of the values: the scalings of p passes."""
+
+    u: Float[Array, "p n"]
+    """Of the rows, after each pass."""
+    v_before: Float[Array, "p m"]
+    """Of the columns, before each pass."""
+    v: Float[Array, " m"]
+    """Of the columns, after the last."""
+    shift: Float[Array, " n"]
+    sums: Float[Array, "n 4"]
+
+
 def squared_distances(
     source: Float[Array, "n d"], target: Float[Array, "m d"]
 ) -> Float[Array, "n m"]:
@@ -68,6 +81,19 @@ def match_of(sums: Float[Array, "n 4"], covered: Float[Array, " m"]) -> Match:
     """A match from each row's sum of weighted targets (3) and of weights (1)."""
     weights = sums[:, 3]
     return Match(weights, sums[:, :3] / (weights + EPSILON)[:, None], covered)
+
+
+def gradient_of_sums(gradient: Match, sums: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
+    """`match_of` backwards."""
+    inverse = 1 / (sums[:, 3:] + EPSILON)
+    of_points = gradient.targets * inverse
+    of_weights = gradient.weights - jnp.sum(of_points * sums[:, :3] * inverse, axis=1)
+    return jnp.concatenate([of_points, of_weights[:, None]], axis=1)
+
+
+def gradient_of_scaling(u: Float[Array, " n"], of_u: Float[Array, " n"]) -> Float[Array, " n"]:
+    """u = 1 / max(sum, tiny) backwards; where the floor was reached, nothing depends on the row."""
+    return jnp.where(u * jnp.finfo(u.dtype).tiny < 1, -u * (u * of_u), 0)
 
 
 def with_ones(points: Float[Array, "m 3"]) -> Float[Array, "m 4"]:

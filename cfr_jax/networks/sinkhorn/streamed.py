@@ -13,17 +13,17 @@ It takes as many sweeps as the forward direction; the last of them does three ti
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from cfr_jax.networks.sinkhorn.affinity import (
-    EPSILON,
     Affinity,
     Match,
+    Trace,
+    gradient_of_scaling,
+    gradient_of_sums,
     log_affinity,
     masked,
     match_of,
@@ -31,42 +31,27 @@ from cfr_jax.networks.sinkhorn.affinity import (
     with_ones,
 )
 
-# A block has so many entries, 16 MiB of float32, and for a large target as many rows as make the
-# product with its features worth reading them.
-_ENTRIES = 1 << 22
+# For a large target a block has as many rows as make the product with its features worth reading.
 _LEAST_ROWS = 128
 _HIGHEST = lax.Precision.HIGHEST
 
 
-def match_streamed(
+def rows_of(m: int, entries: int) -> int:
+    """The rows of a block of so many entries."""
+    return max(_LEAST_ROWS, entries // m)
+
+
+def forward(
     affinity: Affinity,
     points: Float[Array, "m 3"],
+    masks: tuple[Bool[Array, " n"], Bool[Array, " m"]],
     *,
     passes: int,
-    source_mask: Bool[Array, " n"] | None = None,
-    target_mask: Bool[Array, " m"] | None = None,
-    rows: int | None = None,
-) -> Match:
-    """`match`, with memory for n + m rows and a block of at most `rows` rows. Differentiates by its
-    own rule, once."""
+    rows: int,
+) -> tuple[Match, Trace]:
+    """The match, with memory for n + m rows and a block of at most `rows` rows, and its trace."""
     n, m = affinity.source.shape[0], affinity.target.shape[0]
-    everywhere = (jnp.ones(count, bool) for count in (n, m))
-    masks = [
-        default if mask is None else mask
-        for mask, default in zip((source_mask, target_mask), everywhere, strict=True)
-    ]
-    rows = max(_LEAST_ROWS, _ENTRIES // m) if rows is None else rows
-    return _streamed(affinity, points, tuple(masks), passes, rows)
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
-def _streamed(affinity, points, masks, passes, most_rows):
-    return _forward(affinity, points, masks, passes, most_rows)[0]
-
-
-def _forward(affinity, points, masks, passes, most_rows):
-    n, m = affinity.source.shape[0], affinity.target.shape[0]
-    blocks = _Blocks(affinity, masks, most_rows)
+    blocks = _Blocks(affinity, masks, rows)
     tiny = jnp.finfo(points.dtype).tiny
 
     def one_pass(v, shift=None):
@@ -92,21 +77,28 @@ def _forward(affinity, points, masks, passes, most_rows):
 
     sums = lax.map(last, (blocks.rows, shift, u[-1])).reshape(-1, 4)[:n]
     result = match_of(sums, v * found[-1])
-    return result, (affinity, points, masks, u, v_before, v, shift, sums)
+    return result, Trace(u.reshape(passes, -1)[:, :n], v_before, v, shift.reshape(-1)[:n], sums)
 
 
-def _backward(passes, most_rows, residuals, gradient):
-    affinity, points, masks, u, v_before, v, shift, sums = residuals
+def backward(
+    affinity: Affinity,
+    points: Float[Array, "m 3"],
+    masks: tuple[Bool[Array, " n"], Bool[Array, " m"]],
+    trace: Trace,
+    gradient: Match,
+    *,
+    passes: int,
+    rows: int,
+) -> tuple[Affinity, Float[Array, "m 3"]]:
+    """The gradient of what was matched and of the points, in as little memory."""
     n, m = affinity.source.shape[0], affinity.target.shape[0]
-    blocks = _Blocks(affinity, masks, most_rows)
-    rows = (blocks.rows, shift)
-    tiny = jnp.finfo(points.dtype).tiny
+    blocks = _Blocks(affinity, masks, rows)
+    u = jnp.stack([blocks.cut(one, 1) for one in trace.u])
+    v_before, v, sums = trace.v_before, trace.v, trace.sums
+    rows = (blocks.rows, blocks.cut(trace.shift))
 
     # from the match to the sums, to the last scaling of the rows
-    inverse = 1 / (sums[:, 3:] + EPSILON)
-    of_points = gradient.targets * inverse
-    of_weights = gradient.weights - jnp.sum(of_points * sums[:, :3] * inverse, axis=1)
-    of_sums = jnp.concatenate([of_points, of_weights[:, None]], axis=1)
+    of_sums = gradient_of_sums(gradient, sums)
     pull = blocks.cut(of_sums) * u[-1][..., None]
     of_u = jnp.sum(blocks.cut(of_sums * sums), axis=-1) / u[-1]
 
@@ -120,9 +112,7 @@ def _backward(passes, most_rows, residuals, gradient):
     of_v = jnp.sum(of_weighted * one, axis=1) - gradient.covered  # covered is 1 - v
 
     def of_rows(block, a, u, of_u):
-        sums = jnp.matmul(block, a, precision=_HIGHEST) + of_u
-        # where the floor was reached, nothing depends on the row
-        return jnp.where(u * tiny < 1, -u * (u * sums), 0)
+        return gradient_of_scaling(u, jnp.matmul(block, a, precision=_HIGHEST) + of_u)
 
     def back(state, one_pass):
         of_v, of_u = state
@@ -172,10 +162,7 @@ def _backward(passes, most_rows, residuals, gradient):
         of_beta,
         affinity.beta * of_alpha,
     )
-    return of_affinity, (v[:, None] * of_weighted)[:, :3], None
-
-
-_streamed.defvjp(_forward, _backward)
+    return of_affinity, (v[:, None] * of_weighted)[:, :3]
 
 
 class _Blocks:
@@ -188,10 +175,11 @@ class _Blocks:
         self.size = -(-n // self.count)
         self.rows = self.cut(affinity.source), self.cut(masks[0])  # the padding is masked
 
-    def cut(self, values: Float[Array, "n ..."] | Bool[Array, " n"]) -> Array:
+    def cut(self, values: Float[Array, "n ..."] | Bool[Array, " n"], fill: int = 0) -> Array:
         """(n, ...) as (blocks, rows, ...)."""
         more = self.count * self.size - values.shape[0]
-        padded = jnp.pad(values, [(0, more)] + [(0, 0)] * (values.ndim - 1))
+        pad = [(0, more)] + [(0, 0)] * (values.ndim - 1)
+        padded = jnp.pad(values, pad, constant_values=fill)
         return padded.reshape(self.count, self.size, *values.shape[1:])
 
     def make(self, rows, shift=None) -> tuple[Array, Array, Array]:

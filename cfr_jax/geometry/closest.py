@@ -1,0 +1,77 @@
+"""The closest point of a cloud to each query, by comparing all."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int32
+
+_ENTRIES = 1 << 20  # ranks held at a time on a CPU: they stay in a core's cache
+
+
+class Closest(NamedTuple):
+    """For each query the closest point of a cloud, and its squared distance."""
+
+    index: Int32[Array, " n"]
+    square: Float[Array, " n"]
+
+
+def closest(
+    queries: Float[Array, "n 3"],
+    points: Float[Array, "m 3"],
+    mask: Bool[Array, " m"] | None = None,
+) -> Closest:
+    """The closest valid point to each query, by comparing all; for clouds centered near zero.
+
+    Differentiates through the distance, the choice kept.
+    """
+    index = lax.platform_dependent(
+        *lax.stop_gradient((queries, points)),
+        mask,
+        cpu=_closest_by_product,
+        default=_closest_by_differences,
+    )
+    offset = queries - points[index]
+    return Closest(index, jnp.sum(offset * offset, axis=1))
+
+
+def _closest_by_product(queries, points, mask):
+    """On a CPU |y|^2 - 2 x y ranks the points with one matrix product. Its cancellation can only
+    confuse points that lie within float32's rounding of each other."""
+    norms = jnp.sum(points * points, axis=1)
+    if mask is not None:
+        norms = jnp.where(mask, norms, jnp.inf)
+    m = points.shape[0]
+    rows = max(1, min(queries.shape[0], _ENTRIES // m))
+    blocks = -(-queries.shape[0] // rows)
+    padded = jnp.pad(queries, ((0, blocks * rows - queries.shape[0]), (0, 0)))
+
+    def block(here):
+        rank = norms - 2 * jnp.matmul(here, points.T, precision=lax.Precision.HIGHEST)
+        # two plain reductions: XLA's argmin on CPU is not vectorized
+        best = jnp.min(rank, axis=1, keepdims=True)
+        return jnp.min(jnp.where(rank <= best, jnp.arange(m, dtype=jnp.int32), m - 1), axis=1)
+
+    return lax.map(block, padded.reshape(blocks, rows, 3)).reshape(-1)[: queries.shape[0]]
+
+
+def _closest_by_differences(queries, points, mask):
+    """On an accelerator the distances are made inside the reduction: one kernel, nothing stored."""
+    square = squares(queries[:, None], far_where_masked(points, mask))
+    return lax.argmin(square, 1, jnp.int32)
+
+
+def squares(queries: Float[Array, "... 3"], points: Float[Array, "... 3"]) -> Float[Array, ...]:
+    """Squared distances, by differences: |a|^2 - 2ab + |b|^2 cancels to nothing for close points
+    far from the origin."""
+    x, y, z = ((queries[..., axis] - points[..., axis]) ** 2 for axis in range(3))
+    return x + y + z
+
+
+def far_where_masked(
+    points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None
+) -> Float[Array, "n 3"]:
+    """The points, invalid ones infinitely far away, so that nothing finds them."""
+    return points if mask is None else jnp.where(mask[:, None], points, jnp.inf)

@@ -1,0 +1,92 @@
+"""The matches whose gradient is written by hand, and which of them a platform runs.
+
+All of them need little memory for it, differentiate once, and leave the same trace, so that a
+program that is not yet lowered can hold one for CPUs and another for the rest.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from cfr_jax.networks.sinkhorn import scaling, streamed
+from cfr_jax.networks.sinkhorn.affinity import Affinity, Match
+
+
+class Way(NamedTuple):
+    """How a platform does it."""
+
+    kind: Literal["stored", "streamed", "fused"]
+    """The block in memory; block after block of whole rows; inside a kernel."""
+    rows: int
+    """Of a block that is streamed, of a kernel's block."""
+
+
+def match_by_hand(
+    affinity: Affinity,
+    points: Float[Array, "m 3"],
+    *,
+    passes: int,
+    on_cpu: Way,
+    elsewhere: Way,
+    source_mask: Bool[Array, " n"] | None = None,
+    target_mask: Bool[Array, " m"] | None = None,
+) -> Match:
+    """`match` in the way of the platform that the program is lowered for."""
+    sizes = affinity.source.shape[0], affinity.target.shape[0]
+    masks = tuple(
+        jnp.ones(size, bool) if mask is None else mask
+        for mask, size in zip((source_mask, target_mask), sizes, strict=True)
+    )
+    return _match(affinity, points, masks, passes, (on_cpu, elsewhere))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _match(affinity, points, masks, passes, ways):
+    return _forward(affinity, points, masks, passes, ways)[0]
+
+
+def _forward(affinity, points, masks, passes, ways):
+    def run(way, affinity, points, masks):
+        if way.kind == "streamed":
+            return streamed.forward(affinity, points, masks, passes=passes, rows=way.rows)
+        return scaling.forward(_block(way, affinity, masks), points, passes)
+
+    found, trace = _by_platform(run, ways, affinity, points, masks)
+    return found, (affinity, points, masks, trace)
+
+
+def _backward(passes, ways, residuals, gradient):
+    def run(way, affinity, points, masks, trace, gradient):
+        if way.kind == "streamed":
+            return streamed.backward(
+                affinity, points, masks, trace, gradient, passes=passes, rows=way.rows
+            )
+        block = _block(way, affinity, masks, trace.shift)
+        return scaling.backward(block, affinity, points, trace, gradient)
+
+    return *_by_platform(run, ways, *residuals, gradient), None
+
+
+_match.defvjp(_forward, _backward)
+
+
+def _block(way, affinity, masks, shift=None) -> scaling.Block:
+    if way.kind == "fused":
+        # imported here: Pallas takes a quarter of a second that no other form needs
+        from cfr_jax.networks.sinkhorn import fused
+
+        return fused.Fused(affinity, masks, shift, rows=way.rows)
+    return scaling.Stored(affinity, masks, shift)
+
+
+def _by_platform(run, ways, *arguments):
+    on_cpu, elsewhere = (functools.partial(run, way) for way in ways)
+    if ways[0] == ways[1]:
+        return on_cpu(*arguments)
+    return lax.platform_dependent(*arguments, cpu=on_cpu, default=elsewhere)

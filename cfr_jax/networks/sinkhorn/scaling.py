@@ -1,0 +1,128 @@
+"""The match and its gradient by products with the block, whoever has it: stored, or made on the go.
+
+Forward, a pass is u <- 1 / (m v + 1), v <- 1 / (m' u + 1). The gradient goes the same way backwards
+(`streamed` says how); in the end the gradient of log m_ij is m_ij times a product of two thin
+matrices, and the block spends it on the features.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from cfr_jax.networks.sinkhorn.affinity import (
+    Affinity,
+    Match,
+    Trace,
+    gradient_of_scaling,
+    gradient_of_sums,
+    log_affinity,
+    masked,
+    match_of,
+    squared_distances,
+    with_ones,
+)
+
+_HIGHEST = lax.Precision.HIGHEST
+
+
+class Spent(NamedTuple):
+    """Sums of share_ij over a block: times g_j, times f_i, times alpha - |f_i - g_j|^2, alone."""
+
+    source: Float[Array, "n d"]
+    target: Float[Array, "m d"]
+    beta: Float[Array, ""]
+    alpha: Float[Array, ""]
+
+
+@runtime_checkable
+class Block(Protocol):
+    """m_ij = exp(log affinity_ij - shift_i), zero where masked, for its products' sake."""
+
+    shift: Float[Array, " n"]
+    """max(0, the largest log affinity of the row), so that nothing overflows."""
+
+    def rows(self, right: Float[Array, "m c"]) -> Float[Array, "n c"]:
+        """m right."""
+
+    def columns(self, left: Float[Array, "n c"]) -> Float[Array, "m c"]:
+        """m' left."""
+
+    def spend(self, left: Float[Array, "n r"], right: Float[Array, "m r"]) -> Spent:
+        """The sums of share_ij = m_ij left_i . right_j."""
+
+
+def forward(block: Block, points: Float[Array, "m 3"], passes: int) -> tuple[Match, Trace]:
+    """The match, and what its gradient needs."""
+    tiny = jnp.finfo(points.dtype).tiny
+    slack = jnp.exp(-block.shift)
+    v, every = jnp.ones(points.shape[0], points.dtype), []
+    for _ in range(passes):
+        # the floor is reached only where a whole row has vanished: it then stays without partner
+        u = 1 / jnp.maximum(block.rows(v[:, None])[:, 0] + slack, tiny)
+        found = block.columns(u[:, None])[:, 0]
+        every.append((u, v))
+        v = 1 / (found + 1)
+    sums = u[:, None] * block.rows(v[:, None] * with_ones(points))
+    scalings = (jnp.stack(part) for part in zip(*every, strict=True))
+    return match_of(sums, v * found), Trace(*scalings, v, block.shift, sums)
+
+
+def backward(
+    block: Block, affinity: Affinity, points: Float[Array, "m 3"], trace: Trace, gradient: Match
+) -> tuple[Affinity, Float[Array, "m 3"]]:
+    """The gradient of what was matched, and of the points."""
+    u, v_before, v, _, sums = trace
+    of_sums = gradient_of_sums(gradient, sums)
+    pull = of_sums * u[-1][:, None]
+    of_u = jnp.sum(of_sums * sums, axis=1) / u[-1]
+    of_weighted, one = block.columns(pull), with_ones(points)
+    of_v = jnp.sum(of_weighted * one, axis=1) - gradient.covered  # covered is 1 - v
+    a, b = [], []
+    for u_p, v_p in zip(u[::-1], [v, *v_before[:0:-1]], strict=True):
+        a.append(-v_p * (v_p * of_v))
+        b.append(gradient_of_scaling(u_p, block.rows(a[-1][:, None])[:, 0] + of_u))
+        if len(b) < len(u):
+            of_v, of_u = block.columns(b[-1][:, None])[:, 0], jnp.zeros_like(of_u)
+    left = jnp.concatenate([u.T, jnp.stack(b[::-1], 1), pull], axis=1)
+    right = jnp.concatenate([jnp.stack(a[::-1], 1), v_before.T, v[:, None] * one], axis=1)
+    spent = block.spend(left, right)
+    twice, beta = 2 * affinity.beta, affinity.beta
+    of_affinity = Affinity(
+        twice * spent.source, twice * spent.target, spent.beta, beta * spent.alpha
+    )
+    return of_affinity, (v[:, None] * of_weighted)[:, :3]
+
+
+class Stored:
+    """The block as it is."""
+
+    def __init__(
+        self,
+        affinity: Affinity,
+        masks: tuple[Bool[Array, " n"], Bool[Array, " m"]],
+        shift: Float[Array, " n"] | None = None,
+    ):
+        self.affinity = affinity
+        self.square = squared_distances(affinity.source, affinity.target)
+        log_values = masked(log_affinity(self.square, affinity.beta, affinity.alpha), *masks)
+        self.shift = jnp.maximum(jnp.max(log_values, axis=1), 0) if shift is None else shift
+        self.block = jnp.exp(log_values - self.shift[:, None])
+
+    def rows(self, right: Float[Array, "m c"]) -> Float[Array, "n c"]:
+        return jnp.matmul(self.block, right, precision=_HIGHEST)
+
+    def columns(self, left: Float[Array, "n c"]) -> Float[Array, "m c"]:
+        return jnp.matmul(self.block.T, left, precision=_HIGHEST)
+
+    def spend(self, left: Float[Array, "n r"], right: Float[Array, "m r"]) -> Spent:
+        share = self.block * jnp.matmul(left, right.T, precision=_HIGHEST)
+        return Spent(
+            jnp.matmul(share, self.affinity.target, precision=_HIGHEST),
+            jnp.matmul(share.T, self.affinity.source, precision=_HIGHEST),
+            jnp.sum(share * (self.affinity.alpha - self.square)),
+            jnp.sum(share),
+        )
