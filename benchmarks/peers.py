@@ -49,13 +49,15 @@ def installed() -> Iterator[tuple[str, dict]]:
         yield name, options
 
 
-def authors(checkout: Path, source: np.ndarray, target: np.ndarray, folder: Path) -> dict:
-    """Times of the program in `checkout` on this pair (points with normals): its name, and either
-    `milliseconds` of each run or `failure`, why there are none."""
+def authors(
+    checkout: Path, source: np.ndarray, target: np.ndarray, folder: Path, device: str = "cpu"
+) -> dict:
+    """Times of the program in `checkout` on these pairs (b, n, 6), points with normals, on "cpu" or
+    "cuda": its name, and either `milliseconds` of each run or `failure`, why there are none."""
     path = folder / "pair.npz"
     np.savez(path, source=source, target=target)
     child = subprocess.run(
-        [sys.executable, __file__, str(checkout), str(path)],
+        [sys.executable, __file__, str(checkout), str(path), device],
         capture_output=True,
         text=True,
         timeout=600,
@@ -66,7 +68,7 @@ def authors(checkout: Path, source: np.ndarray, target: np.ndarray, folder: Path
     return json.loads(child.stdout.splitlines()[-1])
 
 
-def _run(checkout: Path, pair: Path) -> dict:
+def _run(checkout: Path, pair: Path, device: str) -> dict:
     """In the child: imports the model, builds it, times it."""
     import torch
 
@@ -92,10 +94,10 @@ def _run(checkout: Path, pair: Path) -> dict:
         knn="k_select",
     )
     torch.manual_seed(0)
-    model = importlib.import_module(f"models.{kind}").get_model(arguments).eval()
+    model = importlib.import_module(f"models.{kind}").get_model(arguments).eval().to(device)
     with np.load(pair) as clouds:
         data = {
-            name: torch.from_numpy(clouds[key])[None]
+            name: torch.from_numpy(clouds[key]).to(device)
             for name, key in (("points_src", "source"), ("points_ref", "target"))
         }
     times = []
@@ -103,9 +105,11 @@ def _run(checkout: Path, pair: Path) -> dict:
         for _ in range(RUNS + 2):  # two to warm up
             began = time.perf_counter()
             model(data, 5)
+            if device == "cuda":
+                torch.cuda.synchronize()
             times.append(1e3 * (time.perf_counter() - began))
     return {"name": _KNOWN[kind], "milliseconds": times[2:], "threads": torch.get_num_threads()}
 
 
 if __name__ == "__main__":
-    print(json.dumps(_run(Path(sys.argv[1]), Path(sys.argv[2]))))
+    print(json.dumps(_run(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3])))

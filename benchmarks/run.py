@@ -22,7 +22,7 @@ import jax
 import numpy as np
 import peers
 import report
-from timing import Line, Roof, measure
+from timing import Clock, Line, Roof, measure
 
 import cfr_jax as cfr
 from cfr_jax.evaluation import machine
@@ -106,25 +106,6 @@ def planned(args: argparse.Namespace) -> Iterator[cases.Case]:
         yield from cases.whole(LONG)
 
 
-class Clock:
-    """What is left of the time, and what had no place in it."""
-
-    def __init__(self, seconds: float):
-        self.end = time.monotonic() + seconds
-        self.left_out: list[str] = []
-
-    def left(self) -> float:
-        """Seconds."""
-        return max(0.0, self.end - time.monotonic())
-
-    def has(self, seconds: float, what: str) -> bool:
-        """Whether so many are left; if not, `what` is left out."""
-        if self.left() >= seconds:
-            return True
-        self.left_out.append(what)
-        return False
-
-
 def _peers(args: argparse.Namespace, roof: Roof, clock: Clock) -> Iterator[Line]:
     x, y = clouds.pair(cases.PAPER)
     source, target = (PointCloud(c.astype(np.float64)) for c in (x, y))
@@ -144,7 +125,7 @@ def _peers(args: argparse.Namespace, roof: Roof, clock: Clock) -> Iterator[Line]
             )
         )
     prepared = cases.prepared(cases.PAPER)
-    rows = [np.hstack([c.points, c.normals]).astype(np.float32) for c in prepared]
+    rows = [np.hstack([c.points, c.normals]).astype(np.float32)[None] for c in prepared]
     for checkout in args.authors:
         with tempfile.TemporaryDirectory() as folder:
             found = peers.authors(checkout, *rows, Path(folder))

@@ -52,6 +52,25 @@ def compiled(function: Callable, *arguments) -> tuple[Callable[[], object], floa
     return (lambda: made(*arguments)), seconds
 
 
+class Clock:
+    """What is left of the time, and what had no place in it."""
+
+    def __init__(self, seconds: float):
+        self.end = time.monotonic() + seconds
+        self.left_out: list[str] = []
+
+    def left(self) -> float:
+        """Seconds."""
+        return max(0.0, self.end - time.monotonic())
+
+    def has(self, seconds: float, what: str) -> bool:
+        """Whether so many are left; if not, `what` is left out."""
+        if self.left() >= seconds:
+            return True
+        self.left_out.append(what)
+        return False
+
+
 class Roof:
     """A float32 product that is large enough to show what the cores can do."""
 

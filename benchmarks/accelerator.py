@@ -1,0 +1,239 @@
+"""Measures one machine in one call: python benchmarks/accelerator.py [--minutes 5]
+
+Device and versions, what its arithmetic and memory can do, `register` at several sizes and batches,
+`align`, a training step with its drawing, kernels per call, compile seconds, and whether the
+answers are those of the CPU. Writes accelerator.json and a Markdown table. With `--authors
+CHECKOUT` the authors' PyTorch programs run on the same clouds and device. Everything also runs on
+a CPU. Lines are measured in order of importance; those that no longer fit the time are named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import tempfile
+import time
+from pathlib import Path
+
+import clouds
+import jax
+import jax.numpy as jnp
+import numpy as np
+import peers
+import training_cases
+from device_profile import profile
+from timing import Clock
+
+import cfr_jax as cfr
+from cfr_jax.evaluation import machine
+
+HERE = Path(__file__).parent
+SIZES = ((717, 1), (12000, 1), (717, 32), (2048, 1), (4000, 1), (717, 8))
+RUNS = 15
+EACH = 45.0  # seconds that a line may need, mostly to compile
+
+
+def main() -> None:
+    """Measures line by line and writes what was found."""
+    args = _arguments()
+    clock = Clock(60 * args.minutes)
+    found = {
+        "machine": machine.describe(),
+        "device": jax.devices()[0].device_kind,
+        "devices": len(jax.devices()),
+        "versions": machine.versions() | {"python": platform.python_version()},
+        "commit": machine.commit(),
+        "date": time.strftime("%Y-%m-%d"),
+        "lines": [],
+    }
+
+    def add(name, measure, **about):
+        """One line; what fails is told in it and stops no other."""
+        if not clock.has(EACH, name):
+            return
+        began = time.monotonic()
+        try:
+            line = measure()
+        except Exception as error:  # of any library below: the other lines must come all the same
+            line = {"failure": f"{type(error).__name__}: {str(error)[:300]}"}
+        line = {"name": name, **about, **line, "took": round(time.monotonic() - began, 1)}
+        found["lines"].append(line)
+        print(json.dumps(line), flush=True)
+        args.out.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
+
+    sizes = SIZES if jax.default_backend() != "cpu" else SIZES[:1] + SIZES[3:4]
+    add("roofs", roofs)
+    for points, batch in sizes:
+        add("register", lambda n=points, b=batch: register(n, b), points=points, batch=batch)
+    add("register, neighbors given", lambda: register(717, 1, given=True), points=717, batch=1)
+    add("align", align, points=1024)
+    add("same answers as the CPU", agreement, points=717)
+    for precision in ("tensorfloat32", "bfloat16", "float32"):
+        for batch in args.training:
+            add(
+                "training, drawn on the device",
+                lambda p=precision, b=batch: training_cases.drawn(p, b, args.steps),
+                precision=precision,
+                batch=batch,
+            )
+    for checkout in args.authors:
+        for points, batch in sizes:
+            add(
+                checkout.name,
+                lambda c=checkout, n=points, b=batch: authors(c, n, b),
+                points=points,
+                batch=batch,
+            )
+    found["left_out"] = clock.left_out
+    args.out.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
+    table = as_table(found)
+    args.out.with_suffix(".md").write_text(table, "utf-8")
+    print(table)
+
+
+def timed(call, runs: int = RUNS) -> dict:
+    """Median and fastest milliseconds of a call whose results are waited for."""
+    jax.block_until_ready(call())
+    times = []
+    for _ in range(runs):
+        began = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(1e3 * (time.perf_counter() - began))
+    return {"ms": round(float(np.median(times)), 3), "fastest": round(min(times), 3), "runs": runs}
+
+
+def roofs() -> dict:
+    """TFLOP/s of a large product by precision, and TB/s of a copy (read and written)."""
+    side = 8192 if jax.default_backend() != "cpu" else 2048
+    key = jax.random.key(0)
+    found = {}
+    for name, kind, precision in (
+        ("float32", jnp.float32, "highest"),
+        ("default", jnp.float32, "default"),
+        ("bfloat16", jnp.bfloat16, "default"),
+    ):
+        matrix = jax.random.normal(key, (side, side)).astype(kind)
+        product = jax.jit(lambda a, p=precision: jnp.matmul(a, a, precision=p))
+        seconds = timed(lambda m=matrix, f=product: f(m), 5)["ms"] / 1e3
+        found[f"{name}_tflops"] = round(2 * side**3 / seconds / 1e12, 3)
+    block = jnp.ones(2**28 if side == 8192 else 2**24, jnp.float32)
+    copy = jax.jit(lambda a: a + 1)
+    seconds = timed(lambda: copy(block), 5)["ms"] / 1e3
+    return found | {"copy_tbs": round(2 * block.nbytes / seconds / 1e12, 4)}
+
+
+def pair(points: int, batch: int) -> list[jax.Array]:
+    """Both clouds with normals, (n, 6) or (batch, n, 6), on the device."""
+    made = []
+    for cloud in clouds.pair(points):
+        normals = cfr.prepare(jnp.asarray(cloud)).normals
+        rows = jnp.concatenate([jnp.asarray(cloud), normals], axis=1)
+        made.append(jnp.stack([rows] * batch) if batch > 1 else rows)
+    return jax.block_until_ready(made)
+
+
+def register(points: int, batch: int, given: bool = False) -> dict:
+    """The whole network on clouds with normals, neighbors searched inside unless `given`."""
+    params, arguments = cfr.load_params(), pair(points, batch)
+    if given:
+        arguments = [cfr.prepare(cloud) for cloud in arguments]
+
+    def solve(params, source, target):
+        return cfr.register(params, source, target).transforms
+
+    program = jax.jit(solve if batch == 1 else jax.vmap(solve, (None, 0, 0)))
+    lowered, compiled, seconds = compile_apart(program, params, *arguments)
+    found = timed(lambda: compiled(params, *arguments), RUNS if points < 5000 else 5)
+    kernels = profile(lambda: compiled(params, *arguments))
+    memory = compiled.memory_analysis()
+    scratch = {} if memory is None else {"scratch_mib": memory.temp_size_in_bytes >> 20}
+    return (
+        found | seconds | kernels | scratch | {"pairs_per_s": round(1e3 * batch / found["ms"], 1)}
+    )
+
+
+def compile_apart(program, *arguments):
+    """A jitted function lowered and compiled, with the seconds of each."""
+    began = time.perf_counter()
+    lowered = program.lower(*arguments)
+    middle = time.perf_counter()
+    compiled = lowered.compile()
+    seconds = {
+        "lower_s": round(middle - began, 2),
+        "compile_s": round(time.perf_counter() - middle, 2),
+    }
+    return lowered, compiled, seconds
+
+
+def align() -> dict:
+    """`align` from arrays in host memory, both clouds at its default budget."""
+    source, target = clouds.pair(1024)
+    first = cfr.align(source, target, second_look=False)
+    found = timed(lambda: cfr.align(source, target, second_look=False).transform)
+    return found | {"compile_s": round(first.seconds["compile"], 2)}
+
+
+def agreement() -> dict:
+    """Largest difference of the transforms from the CPU's, at full precision, and whether the same
+    call twice gives the same bits."""
+    params, arguments = cfr.load_params(), pair(717, 1)
+
+    def solve(params, source, target):
+        with jax.default_matmul_precision("float32"):
+            return cfr.register(params, source, target).transforms
+
+    on_device = [np.asarray(jax.jit(solve)(params, *arguments)) for _ in range(2)]
+    cpu = jax.devices("cpu")[0]
+    moved = jax.device_put((params, *arguments), cpu)
+    with jax.default_device(cpu):
+        wanted = np.asarray(jax.jit(solve)(*moved))
+    return {
+        "off_by": float(np.abs(on_device[0] - wanted).max()),
+        "same_twice": bool((on_device[0] == on_device[1]).all()),
+    }
+
+
+def authors(checkout: Path, points: int, batch: int) -> dict:
+    """The authors' program on the same clouds, on the GPU where there is one."""
+    rows = [np.asarray(cloud).reshape(batch, points, 6) for cloud in pair(points, batch)]
+    device = "cuda" if jax.default_backend() == "gpu" else "cpu"
+    with tempfile.TemporaryDirectory() as folder:
+        found = peers.authors(checkout, *rows, Path(folder), device)
+    if "failure" in found:
+        return found
+    times = found["milliseconds"]
+    return {"ms": round(float(np.median(times)), 3), "fastest": round(min(times), 3)}
+
+
+def as_table(found: dict) -> str:
+    """The lines as Markdown."""
+    about = f"{found['device']}, jax {found['versions']['jax']}, commit {found['commit']}"
+    rows = [f"{about}, {found['date']}", "", "| what | ms | more |", "|---|---|---|"]
+    for line in found["lines"]:
+        given = [f"{k} {line[k]}" for k in ("points", "batch", "precision") if k in line]
+        skipped = {"name", "ms", "points", "batch", "precision"}
+        more = "; ".join(f"{k} {v}" for k, v in line.items() if k not in skipped)
+        rows.append(f"| {', '.join([line['name'], *given])} | {line.get('ms', '')} | {more} |")
+    rows += [f"left out: {', '.join(found['left_out'])}"] if found["left_out"] else []
+    return "\n".join(rows) + "\n"
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=5.0, help="begin nothing after so many")
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "accelerator.json")
+    parser.add_argument(
+        "--training", type=int, nargs="*", default=[64], metavar="BATCH",
+        help="batch sizes of the training steps; none to leave them out",
+    )  # fmt: skip
+    parser.add_argument("--steps", type=int, default=10, help="training steps in one program")
+    parser.add_argument(
+        "--authors", type=Path, action="append", default=[], metavar="CHECKOUT",
+        help="of the authors' CFR or RPM-Net in PyTorch; may be given twice",
+    )  # fmt: skip
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
