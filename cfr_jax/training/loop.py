@@ -93,7 +93,9 @@ class _Training:
         if unplanned:
             self._plan()
         steps = devices.replicate(np.int32(self.task.steps), self.task.mesh)
-        self.state = self.state.replace(optimizer=optimizers.planned(self.state.optimizer, steps))
+        self.state = dataclasses.replace(
+            self.state, optimizer=optimizers.planned(self.state.optimizer, steps)
+        )
         with stopping.stop_requests() as requests:
             for phase, ran in remaining(self.task.phases, self.about["step"]):
                 self._go_through(phase, ran, requests)
