@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import peers
-import training_cases
+import train_drawn
 from device_profile import profile
 from timing import Clock
 
@@ -73,7 +73,7 @@ def main() -> None:
         for batch in args.training:
             add(
                 "training, drawn on the device",
-                lambda p=precision, b=batch: training_cases.drawn(p, b, args.steps),
+                lambda p=precision, b=batch: training(p, b, args.steps),
                 precision=precision,
                 batch=batch,
             )
@@ -192,6 +192,15 @@ def agreement() -> dict:
         "off_by": float(np.abs(on_device[0] - wanted).max()),
         "same_twice": bool((on_device[0] == on_device[1]).all()),
     }
+
+
+def training(precision: str, batch: int, steps: int) -> dict:
+    """A training step at full size on pairs that the device draws, and the drawing's share."""
+    sizes = {"points": 717, "neighbors": 64, "batch": batch, "steps": steps, "repeats": 3}
+    found = train_drawn.measure(precision, **sizes)
+    alone = train_drawn.measure_drawing(**sizes)["ms_per_step"]
+    step = found.pop("ms_per_step")
+    return {"ms": step, "drawing_ms": alone, "drawing_share": round(alone / step, 3)} | found
 
 
 def authors(checkout: Path, points: int, batch: int) -> dict:

@@ -15,6 +15,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
+from device_profile import profile
 from train_step import ellipsoids, start
 
 from cfr_jax.data.augment import Sampling
@@ -82,6 +83,15 @@ def measure(
         state, measured = program(state, *given)
     jax.block_until_ready(measured.total)
     seconds = (time.perf_counter() - begun) / (repeats * steps)
+    held = [state]
+
+    def stretch():  # the state is donated, so each call hands on the next one
+        held[0], measured = program(held[0], *given)
+        return measured.total
+
+    seen = profile(stretch)
+    if seen:
+        seen["busy"] = round(seen["kernel_ms"] / (1e3 * seconds * steps), 3)
     return {
         "precision": precision,
         "batch": batch,
@@ -93,7 +103,8 @@ def measure(
         "compile_s": round(compiled - traced, 1),
         "scratch_GiB": round(program.memory_analysis().temp_size_in_bytes / 2**30, 2),
         "loss": float(jnp.mean(measured.total)),
-        "skipped": int(state.skipped),
+        "skipped": int(held[0].skipped),
+        **seen,
     }
 
 
