@@ -17,7 +17,7 @@ from cfr_jax.data.device_pairs import Shapes, draw_pairs
 from cfr_jax.data.loader import Mixture, ShapeSource, items_at
 from cfr_jax.training import devices, learner, loop, optimizers, step, validation
 from cfr_jax.training.checkpoints import Checkpoints
-from cfr_jax.training.config import Phase
+from cfr_jax.training.config import Phase, TrainSection
 from cfr_jax.training.drawing import Leg
 from cfr_jax.training.drawing.device import DeviceDrawing
 from cfr_jax.training.reporting.reporter import Reporter
@@ -45,7 +45,7 @@ def config(corpus_file, **train):
     return dataclasses.replace(
         given,
         phases=(Phase(16, POINTS, NEIGHBORS, BATCH),),
-        train=dataclasses.asdict(given.train) | changed,
+        train=TrainSection(**dataclasses.asdict(given.train) | changed),
     )
 
 
@@ -233,9 +233,9 @@ def test_what_the_device_cannot_draw_is_refused(corpus_file, unchecked):
         ({"minutes": -1.0}, "minutes: got -1.0"),
     ],
 )
-def test_what_does_not_fit_together_is_named(corpus_file, tmp_path, change, wanted):
+def test_what_does_not_fit_together_is_named(corpus_file, change, wanted):
     with pytest.raises(ValueError, match=wanted):
-        run(config(corpus_file, **change), tmp_path)
+        config(corpus_file, **change)
 
 
 def test_bfloat16_is_of_cfr_alone(corpus_file, tmp_path):
