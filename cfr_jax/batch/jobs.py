@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from cfr_jax.data.layout import CLOUD_SUFFIXES, Layout, loose_files, scans_of
-from cfr_jax.data.making.meshes import SUFFIXES as MESH_SUFFIXES
 from cfr_jax.data.pairs import CsvPairs, Hdf5Pairs
-from cfr_jax.io import PointCloud
+from cfr_jax.io import PointCloud, formats
 from cfr_jax.io.cloud import usable_normals
-from cfr_jax.io.files import SUFFIXES as READABLE
 
 _ROLE = re.compile(r"(^|[._/-])(source|src|target|tgt|dst)(?=$|[._/-])")
 _TARGETS = ("target", "tgt", "dst")
@@ -55,8 +53,7 @@ def jobs_of(layout: Layout, target: Path | None = None) -> tuple[list[Job], str]
         case "clouds":
             files = loose_files(layout.path, CLOUD_SUFFIXES)
         case "meshes":
-            suffixes = tuple(suffix for suffix in MESH_SUFFIXES if suffix in READABLE)
-            files = loose_files(layout.path, suffixes)
+            files = loose_files(layout.path, tuple(formats.by_suffix(formats.of_surfaces())))
         case _:
             raise ValueError(
                 f"{layout.path} is {layout.found}: shapes, and no pairs\n"

@@ -22,11 +22,13 @@ from typing import Literal, get_args
 
 import h5py
 
-from cfr_jax.data.making.meshes import SUFFIXES as MESH_SUFFIXES
+from cfr_jax.data.making.mesh_formats import mesh_formats
+from cfr_jax.io import formats
 
 Kind = Literal["pair-list", "pair-file", "corpus", "modelnet40", "kitti", "clouds", "meshes"]
 KINDS = get_args(Kind)
-CLOUD_SUFFIXES = (".ply", ".pcd", ".xyz", ".npy", ".npz", ".bin", ".las", ".laz", ".txt")
+CLOUD_SUFFIXES = tuple(formats.by_suffix(form for form in formats.of_clouds() if form.loose))
+MESH_SUFFIXES = tuple(formats.by_suffix(mesh_formats()))
 HDF5_SUFFIXES = (".h5", ".hdf5")
 # Of these suffixes a file may be one or the other; its header tells.
 _EITHER = (".ply",)
