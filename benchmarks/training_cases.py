@@ -6,11 +6,11 @@ import time
 
 import jax
 import numpy as np
-from cfr_jax.data.device_pairs import Shapes, draw_pairs
 from device_profile import profile
 from train_step import ellipsoids
 
 from cfr_jax.data.augment import Sampling
+from cfr_jax.data.device_pairs import Shapes, draw_pairs
 from cfr_jax.networks.cfr.iterations import unroll
 from cfr_jax.networks.cfr.modules import init_params
 from cfr_jax.networks.inputs import Settings

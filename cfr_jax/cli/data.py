@@ -175,7 +175,7 @@ def _info(args: argparse.Namespace) -> int:
     from cfr_jax.data.corpus import read_corpus
     from cfr_jax.data.layout import recognize
 
-    if args.file.exists() and (layout := recognize(args.file)).kind not in ("corpus", "modelnet40"):
+    if args.file.exists() and (layout := recognize(args.file)).kind.read_shapes is None:
         if args.sheet is not None:
             raise ValueError(f"--sheet: {layout}, wanted a corpus of shapes")
         print(layout)
