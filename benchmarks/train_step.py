@@ -24,7 +24,8 @@ import optax
 
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.corpus import Corpus
-from cfr_jax.data.loader import ShapeSource, batch_at
+from cfr_jax.data.loader import batch_at
+from cfr_jax.data.sources import ShapeSource
 from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.networks.cfr import modules as network
 from cfr_jax.networks.cfr.iterations import unroll

@@ -8,7 +8,7 @@ def get_config() -> EvaluationConfig:
     return EvaluationConfig(
         title="Depth images of a room",
         data={
-            "kind": "pairs",
+            "kind": "auto",
             "path": "data/scans/rgbd/pairs.h5",  # or a list: source,target,16 numbers
             # first and stop: pairs of these frames alone; `scans.py` leaves (400, 500) for a test
             "frames": (),

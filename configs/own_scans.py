@@ -40,7 +40,7 @@ def sources() -> dict[str, dict[str, Any]]:
     """What there may be. A source whose `repeat` is 0 is left out."""
     return {
         # views of one scan, turned and cropped: needs no known motion
-        "scans": {"kind": "scans", "path": "", "repeat": 1},
+        "scans": {"kind": "clouds", "path": "", "repeat": 1},
         # a CSV list `source,target,16 numbers`, or HDF5
-        "pairs": {"kind": "pairs", "path": "", "repeat": 0},
+        "pairs": {"kind": "auto", "path": "", "repeat": 0},
     }

@@ -19,7 +19,7 @@ LIDAR = {
     "distances": (2.0, 5.0, 10.0),  # m between the frames
     "stride": 1,  # frames
 }
-RGBD = {"kind": "pairs", "path": "data/scans/rgbd/pairs.h5"}
+RGBD = {"kind": "pair-file", "path": "data/scans/rgbd/pairs.h5"}
 
 
 def get_config() -> TrainingConfig:

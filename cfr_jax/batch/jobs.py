@@ -9,12 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cfr_jax.data.layout import CLOUD_SUFFIXES, Layout, loose_files, scans_of
-from cfr_jax.data.making.meshes import SUFFIXES as MESH_SUFFIXES
-from cfr_jax.data.pairs import CsvPairs, Hdf5Pairs
-from cfr_jax.io import PointCloud
-from cfr_jax.io.cloud import usable_normals
-from cfr_jax.io.files import SUFFIXES as READABLE
+from cfr_jax.data.layout import Layout
 
 _ROLE = re.compile(r"(^|[._/-])(source|src|target|tgt|dst)(?=$|[._/-])")
 _TARGETS = ("target", "tgt", "dst")
@@ -43,56 +38,18 @@ def jobs_of(layout: Layout, target: Path | None = None) -> tuple[list[Job], str]
     With `target` every cloud of a folder is laid on that one file. Raises ValueError where there
     is no pair, and for data that are no pairs, with what they are for.
     """
-    if target is not None and layout.kind not in ("clouds", "meshes", "kitti"):
+    kind = layout.kind
+    if target is not None and kind.list_scans is None:
         raise ValueError(f"target: {layout.path} is {layout.found}, which says its own targets")
-    match layout.kind:
-        case "pair-list":
-            return _of_list(layout.path)
-        case "pair-file":
-            return _of_file(layout.path)
-        case "kitti":
-            files = [path for scans in scans_of(layout.path).values() for path in scans]
-        case "clouds":
-            files = loose_files(layout.path, CLOUD_SUFFIXES)
-        case "meshes":
-            suffixes = tuple(suffix for suffix in MESH_SUFFIXES if suffix in READABLE)
-            files = loose_files(layout.path, suffixes)
-        case _:
-            raise ValueError(
-                f"{layout.path} is {layout.found}: shapes, and no pairs\n"
-                "`evaluate.py` makes pairs of shapes, and `cfr data info` shows them"
-            )
-    return _of_files(layout, files, target)
-
-
-def _of_list(path: Path) -> tuple[list[Job], str]:
-    held = CsvPairs(path)
-    places = [tuple(path.parent / name for name in names) for names in held.listed]
-    if not any(file.exists() for place in places for file in place):
-        raise ValueError(
-            f"{path}: of its {len(places)} pairs no file is there, as {places[0][0]}\n"
-            "wanted lines of `source,target`, paths relative to the folder of the list"
-        )
-    return _numbered(held.listed, places), "pairs of a list"
-
-
-def _of_file(path: Path) -> tuple[list[Job], str]:
-    held = Hdf5Pairs(path)
-    names = [(f"{name}/source", f"{name}/target") for name in held.names]
-
-    def reader(index: int) -> Callable[[], tuple[PointCloud, PointCloud]]:
-        def read() -> tuple[PointCloud, PointCloud]:
-            pair = held[index]
-            sides = ((pair.source, pair.source_normals), (pair.target, pair.target_normals))
-            clouds = [
-                PointCloud(points, None if normals is None else usable_normals(normals), name)
-                for (points, normals), name in zip(sides, names[index], strict=True)
-            ]
-            return clouds[0], clouds[1]
-
-        return read
-
-    return _numbered(names, [reader(index) for index in range(len(held))]), "pairs of an HDF5 file"
+    if kind.list_pairs is not None:
+        listing = kind.list_pairs(layout.path)
+        return _numbered(listing.names, listing.pairs), listing.how
+    if kind.list_scans is not None:
+        return _of_files(layout, kind.list_scans(layout.path), target)
+    raise ValueError(
+        f"{layout.path} is {layout.found}, and no pairs\n"
+        "`evaluate.py` makes pairs of shapes, and `cfr data info` shows them"
+    )
 
 
 def _of_files(layout: Layout, files: list[Path], target: Path | None) -> tuple[list[Job], str]:

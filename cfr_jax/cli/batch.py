@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cfr_jax.cli.shared import numbers, outputs
+from cfr_jax.data import kinds
 
 if TYPE_CHECKING:
     from cfr_jax.batch.jobs import Job
@@ -19,12 +20,11 @@ UNTRUSTED = 3
 _DESCRIPTION = """\
 Registers many pairs. PAIRS is recognized by its layout, which is told before anything is done:
 
-  a CSV list of `source,target` lines   paths relative to the list's folder; a line may go on with
-                                        16 numbers, the known truth, which is not used here
-  an HDF5 file of pairs                 a group a pair with source (N, 3) and target (M, 3)
-  a folder of clouds or meshes          onto --target; or a_source.ply onto a_target.ply; or each
-                                        file onto the one before it
-  a folder of KITTI odometry            each scan onto the one before it
+{kinds}
+
+Paths in a list are relative to its folder; a line may go on with 16 numbers, the known truth, which
+is not used here. A pair in HDF5 is a group with source (N, 3) and target (M, 3). The files of a
+folder are laid on --target, or a_source.ply on a_target.ply, or each file on the one before it.
 
 Two files are written. results.jsonl holds everything that is known, a line a pair, each written as
 soon as its pair is done. results.csv, the table in the order of the pairs, appears when all are.
@@ -47,7 +47,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "batch",
         help="many pairs, from a list or a folder, into one table",
-        description=_DESCRIPTION,
+        description=_DESCRIPTION.format(kinds=_kinds()),
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
@@ -58,7 +58,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--out", metavar="FILE.csv", type=Path, required=True, help="where the table goes"
     )
     parser.add_argument(
-        "--layout", metavar="KIND", help="what PAIRS is, where it is not recognized as it should be"
+        "--layout",
+        metavar="KIND",
+        help="which of these PAIRS is, where it is not recognized as it should be",
     )
     parser.add_argument(
         "--target", metavar="FILE", type=Path, help="the target of every cloud in a folder"
@@ -96,6 +98,15 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     how.add_argument(
         "--workers", metavar="N", type=numbers.positive, help="threads that read ahead"
+    )
+
+
+def _kinds() -> str:
+    """The kinds of data that have pairs, or clouds to pair, a line each."""
+    return "\n".join(
+        f"  {kind.name:11s} {kind.words}"
+        for kind in kinds.known()
+        if kind.list_pairs is not None or kind.list_scans is not None
     )
 
 

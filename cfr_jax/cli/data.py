@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.data.making.mesh_formats import mesh_formats
+from cfr_jax.io.formats import in_words
 
 if TYPE_CHECKING:
     from cfr_jax.data.making.build import Report
@@ -21,10 +23,11 @@ Builds the corpora that networks are trained and tested on, and shows what is in
 """
 
 _BUILD = """\
-Turns a folder of meshes (.off .obj .stl .ply .glb .gltf .pmd .ac) into a corpus: 2048 points a
-shape, drawn by area, with the normals of their faces, in the unit sphere. The first folder below
-FOLDER is the category. Flat shapes, shapes of fewer than 20 faces (a box has 12: --least-faces),
-and duplicates are left out; left_out.txt, beside the corpus, names them.
+Turns a folder of meshes into a corpus: 2048 points a shape, drawn by area, with the normals of
+their faces, in the unit sphere. The first folder below FOLDER is the category. Flat shapes, shapes
+of fewer than 20 faces (a box has 12: --least-faces), and duplicates are left out; left_out.txt,
+beside the corpus, names them. Meshes are files that end in
+{suffixes}
 
   cfr data build meshes/ --out corpus/ --unseen lamp,seat    train.h5, val.h5, test.h5
   cfr data build meshes/ --out corpus.h5                     all shapes in one file
@@ -64,7 +67,10 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     )
 
     build = commands.add_parser(
-        "build", help="a corpus from a folder of meshes", description=_BUILD, **style
+        "build",
+        help="a corpus from a folder of meshes",
+        description=_BUILD.format(suffixes=in_words(mesh_formats())),
+        **style,
     )
     build.set_defaults(run=_build)
     build.add_argument("folder", metavar="FOLDER", type=Path, help="meshes, a folder per category")
@@ -169,7 +175,7 @@ def _info(args: argparse.Namespace) -> int:
     from cfr_jax.data.corpus import read_corpus
     from cfr_jax.data.layout import recognize
 
-    if args.file.exists() and (layout := recognize(args.file)).kind not in ("corpus", "modelnet40"):
+    if args.file.exists() and (layout := recognize(args.file)).kind.read_shapes is None:
         if args.sheet is not None:
             raise ValueError(f"--sheet: {layout}, wanted a corpus of shapes")
         print(layout)

@@ -6,11 +6,13 @@ import argparse
 import importlib.util
 import json
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
 from cfr_jax import refine
 from cfr_jax.cli.shared import numbers, outputs
+from cfr_jax.io import formats
 
 UNTRUSTED = 3
 
@@ -24,8 +26,7 @@ of the same object or place, at the same scale.
 
 _EPILOG = """\
 files:
-  clouds    .ply .pcd .xyz .txt .csv .npy .npz .bin (KITTI) .las .laz (pip install "cfr_jax[io]")
-  surfaces  .off .obj .stl .glb .gltf, and .ply with faces: points are drawn from them by area
+{files}
 
 what the quality means:
   fitness         share of the source's points that lie within the inlier distance of the target
@@ -54,7 +55,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "register",
         help="the motion that lays one point cloud on another",
         description=_DESCRIPTION,
-        epilog=_EPILOG,
+        epilog=_EPILOG.format(files=_files()),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
@@ -67,7 +68,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--out",
         metavar="FILE",
         type=Path,
-        help=f"the moved source, all its points ({' '.join(outputs.CLOUD_SUFFIXES)})",
+        help=f"the moved source, all its points ({' '.join(outputs.cloud_suffixes())})",
     )
     written.add_argument(
         "--json",
@@ -151,6 +152,27 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
 
 
+def _files() -> str:
+    """The formats that are read, a line of each sort, wrapped."""
+    bare = [form for form in formats.known() if form.holds == "surface"]
+    either = [form for form in formats.known() if form.holds == "either"]
+    surfaces = f"{formats.in_words(bare)}, and {formats.in_words(either)} with faces: points are"
+    lines = {
+        "clouds": formats.in_words(formats.of_clouds()),
+        "surfaces": f"{surfaces} drawn from them by area",
+    }
+    return "\n".join(
+        textwrap.fill(
+            text,
+            width=100,
+            initial_indent=f"  {sort:10s}",
+            subsequent_indent=" " * 12,
+            break_on_hyphens=False,
+        )
+        for sort, text in lines.items()
+    )
+
+
 def run(args: argparse.Namespace) -> int:
     """Reads, registers, writes; whatever can be refused is refused before JAX is imported."""
     to_stdout = args.json == Path("-")
@@ -202,7 +224,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_outputs(args: argparse.Namespace, to_stdout: bool) -> None:
     wanted = {
-        "--out": (args.out, outputs.CLOUD_SUFFIXES),
+        "--out": (args.out, outputs.cloud_suffixes()),
         "--json": (None if to_stdout else args.json, ()),
         "--view": (args.view, outputs.PAGE_SUFFIXES),
         "--png": (args.png, outputs.PICTURE_SUFFIXES),

@@ -1,6 +1,6 @@
 """Training pairs of shapes, drawn on the device that trains on them.
 
-What `loader.ShapeSource` and `augment` do on the host, with the same distributions (not the same
+What `sources.ShapeSource` and `augment` do on the host, with the same distributions (not the same
 random numbers), as one program: nothing is copied from the host but the numbers of the shapes. A
 pair is a function of its key alone, and the key of (seed, position in the stream), so a resumed
 run, and any number of devices, draw the same pairs.

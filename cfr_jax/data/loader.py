@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import collections
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int
 
-from cfr_jax.data.augment import Sampling, View, choose_rows, finish_pair
-from cfr_jax.data.corpus import Corpus
-from cfr_jax.data.protocol import crop
+from cfr_jax.data.augment import Sampling
 
 
 @runtime_checkable
@@ -30,51 +27,6 @@ class Source(Protocol):
     def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
         """A pair made of item `index`, as `augment.finish_pair` gives it."""
         ...
-
-
-@dataclass(frozen=True)
-class ShapeSource:
-    """Both clouds are views of one shape of a corpus."""
-
-    corpus: Corpus
-
-    def __len__(self) -> int:
-        return len(self.corpus)
-
-    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
-        """Each cloud is a crop and a draw of points of its own."""
-        points, normals = self.corpus[index]
-        uneven = rng.random() < sampling.uneven
-        views = []
-        for _ in range(2):
-            kept = crop(points, rng.uniform(*sampling.keep), rng)
-            rows = kept[choose_rows(points[kept], sampling, uneven, rng)]
-            views.append(View(points[rows], normals[rows]))
-        return finish_pair(*views, np.eye(4), sampling, rng)
-
-
-@dataclass(frozen=True)
-class Mixture:
-    """Several sources as one; `repeats[s]` times an epoch each item of source `s` comes."""
-
-    sources: Sequence[Source]
-    repeats: Sequence[int]
-
-    def __len__(self) -> int:
-        return sum(len(s) * r for s, r in zip(self.sources, self.repeats, strict=True))
-
-    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
-        """From the source that item `index` of the whole belongs to."""
-        source, index = self.locate(index)
-        return source.draw(index, sampling, rng)
-
-    def locate(self, index: int) -> tuple[Source, int]:
-        """The source that item `index` of the whole belongs to, and its number there."""
-        for source, repeat in zip(self.sources, self.repeats, strict=True):
-            if index < len(source) * repeat:
-                return source, index % len(source)
-            index -= len(source) * repeat
-        raise IndexError(f"item {index} beyond the last")
 
 
 def batch_at(source: Source, position: int, size: int, sampling: Sampling, seed: int) -> dict:

@@ -1,6 +1,6 @@
 """A pair of clouds to register, and the files that hold many of them.
 
-`open_pairs` reads two forms, and both give the same `Pair`, one at a time and only when asked for:
+`CsvPairs` and `Hdf5Pairs` give the same `Pair`, one at a time and only when asked for:
 
     CSV   a line a pair: the files of source and target, which may be anything `cfr_jax.io` reads,
           relative to the folder of the list, then perhaps 16 numbers, the true motion row by row.
@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,12 +51,17 @@ def among(chosen: tuple[int, int] | None, frames: Iterable[int | str]) -> bool:
     )
 
 
-def open_pairs(path: str | Path) -> PairFile:
-    """The pairs of a CSV list or of an HDF5 file; raises ValueError where there are none."""
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"no list of pairs at {path}")
-    return Hdf5Pairs(path) if h5py.is_hdf5(path) else CsvPairs(path)
+class PairsOnDemand(Sequence[Pair]):
+    """`count` pairs, number i being `make(i)`, made whenever it is asked for."""
+
+    def __init__(self, count: int, make: Callable[[int], Pair]):
+        self._rows, self._make = range(count), make
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: int) -> Pair:
+        return self._make(self._rows[index])
 
 
 class PairFile(Sequence[Pair]):
@@ -64,6 +69,11 @@ class PairFile(Sequence[Pair]):
 
     path: Path
     names: tuple[str, ...]
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise ValueError(f"no file of pairs at {path}")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -81,7 +91,7 @@ class CsvPairs(PairFile):
     """A list of pairs; the list is checked when it is opened, each cloud when it is read."""
 
     def __init__(self, path: str | Path):
-        self.path = Path(path)
+        super().__init__(path)
         self._rows: list[tuple[str, str, np.ndarray | None]] = []
         try:
             with open(self.path, newline="", encoding="utf-8-sig") as file:
@@ -91,7 +101,7 @@ class CsvPairs(PairFile):
                     if row:
                         self._rows.append(row)
         except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{self.path} is neither CSV nor HDF5 ({error})") from error
+            raise ValueError(f"{self.path} is no list in CSV ({error})") from error
         if not self._rows:
             raise ValueError(f"{self.path} lists no pair; wanted lines of `source,target`")
         self.names = tuple(f"{source} -> {target}" for source, target, _ in self._rows)
@@ -121,7 +131,7 @@ class Hdf5Pairs(PairFile):
     """Groups of an HDF5 file, in the order of their names."""
 
     def __init__(self, path: str | Path):
-        self.path = Path(path)
+        super().__init__(path)
         try:
             with h5py.File(self.path, "r") as file:
                 self.names = tuple(sorted(k for k, v in file.items() if isinstance(v, h5py.Group)))
@@ -163,6 +173,14 @@ class Hdf5Pairs(PairFile):
             transform=None if truth is None else check_rigid(f"{where}: transform", truth),
             overlap=float(held["overlap"]) if "overlap" in held else None,
         )
+
+
+def with_truth(held: PairFile, index: int) -> Pair:
+    """Pair `index`; raises ValueError where its true transform is not known."""
+    pair = held[index]
+    if pair.transform is None:
+        raise ValueError(f"{held.path}: {pair.name} has no true transform to learn from")
+    return pair
 
 
 def _parse_row(

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from cfr_jax.data.corpus import Corpus
-from cfr_jax.data.pairs import Pair
+from cfr_jax.data.pairs import Pair, PairsOnDemand
 from cfr_jax.geometry import motions
 
 Rng = np.random.RandomState | np.random.Generator
@@ -53,6 +53,18 @@ partial = Protocol("partial", keep=0.7)
 low_overlap = Protocol("low_overlap", keep=0.5)
 partial_both_ways = Protocol("partial_both_ways", keep=0.7, both_ways=True)
 partial_any_rotation = Protocol("partial_any_rotation", keep=0.7, angle=None)
+PROTOCOLS = {
+    made.name: made
+    for made in (clean, noise, partial, low_overlap, partial_both_ways, partial_any_rotation)
+}
+
+
+def fixed_pairs(corpus: Corpus, protocol: str) -> PairsOnDemand:
+    """The published test set that the protocol of this name makes of `corpus`."""
+    if protocol not in PROTOCOLS:
+        raise ValueError(f"protocol: got {protocol!r}, wanted one of {', '.join(PROTOCOLS)}")
+    chosen = PROTOCOLS[protocol]
+    return PairsOnDemand(len(corpus), lambda index: fixed_pair(corpus, index, chosen))
 
 
 def fixed_pair(corpus: Corpus, index: int, protocol: Protocol) -> Pair:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
-from ml_collections import ConfigDict
 from tqdm import tqdm
 
 from cfr_jax.data.pairs import Pair
@@ -46,7 +45,7 @@ def compare(
         from cfr_jax.evaluation.drawing.gallery import draw_gallery
 
         new_figure(1, 1)  # better missed now than after all methods have run
-    pairs = read_pairs(ConfigDict(config.data), config.limit, out / "cache")
+    pairs = read_pairs(config.data, config.limit, out / "cache")
     held = {
         m.name: run_method(m, pairs, out / "parts" / f"{m.name}.json", config.timeout)
         for m in methods

@@ -43,8 +43,8 @@ class EvaluationConfig:
 
     title: str
     data: dict[str, Any]
-    """`kind` ("auto": told from the layout), `path`, and the settings of that kind, which
-    `evaluation.datasets` explains and checks."""
+    """`kind` (one of `data.kinds`, or "auto": told from the layout), `path`, and the settings of
+    that kind: those that its `evaluate` takes."""
     methods: dict[str, MethodEntry]
     limit: int = 0  # pairs, from the first; 0 for all
     seed: int = 0  # of the methods that draw, and of the intervals

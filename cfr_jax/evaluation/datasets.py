@@ -3,136 +3,59 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from cfr_jax.data import kitti, protocol
-from cfr_jax.data.corpus import Corpus, read_corpus
+from cfr_jax.data import kinds
+from cfr_jax.data.kinds.kind import DataKind, settings_of
 from cfr_jax.data.layout import recognize
-from cfr_jax.data.modelnet import read_modelnet40
-from cfr_jax.data.pairs import Hdf5Pairs, Pair, among, open_pairs
+from cfr_jax.data.pairs import Pair
 from cfr_jax.geometry.motions import nearest_motion
 
-_PROTOCOLS = {
-    made.name: made
-    for made in (
-        protocol.clean,
-        protocol.noise,
-        protocol.partial,
-        protocol.low_overlap,
-        protocol.partial_both_ways,
-        protocol.partial_any_rotation,
-    )
-}
-Make = Callable[[int], Pair]
-# What `data.layout` recognizes, as the kinds of a config, and a config that has all their settings.
-_RECOGNIZED = {
-    "corpus": "corpus",
-    "modelnet40": "modelnet40",
-    "kitti": "kitti",
-    "pair-list": "pairs",
-    "pair-file": "pairs",
-}
-_CONFIGS = {
-    "corpus": "eval_open_cad.py",
-    "modelnet40": "eval_modelnet40.py",
-    "kitti": "eval_scans_lidar.py",
-    "pairs": "eval_scans_rgbd.py",
-}
 
-
-def read_pairs(data: Any, limit: int, cache: Path) -> list[Pair]:
+def read_pairs(data: Mapping[str, Any], limit: int, cache: Path) -> list[Pair]:
     """The first `limit` pairs (0: all) of the `data` section of a config, all of them with truth.
 
-    `data.kind` is "corpus", "modelnet40", "kitti", or "pairs", or "auto" to have it told from the
-    layout of `data.path`, a file or folder. Scans have their refined truths kept in the folder
-    `cache`. Raises ValueError where data is missing, with what the folder should hold, and for a
-    pair without a truth.
+    `kind` is the name of a kind in `data.kinds`, or "auto" to have it told from the layout of
+    `path`, a file or folder. Scans have their refined truths kept in the folder `cache`.
+    Raises ValueError where data is missing, with what the folder should hold, and for a pair
+    without a truth.
     """
-    kinds = {"corpus": _corpus, "modelnet40": _modelnet40, "kitti": _kitti, "pairs": _pairs}
-    if data.kind not in (*kinds, "auto"):
-        raise ValueError(f"data.kind is {data.kind!r}, wanted auto or one of {', '.join(kinds)}")
     if limit < 0:
         raise ValueError(f"limit is {limit}, wanted 0 for all pairs, or how many")
-    kind = _recognized(data.path) if data.kind == "auto" else data.kind
-    try:
-        count, make = kinds[kind](data, cache)
-    except AttributeError as error:  # of the config
+    kind = _chosen(data)
+    assert kind.evaluate is not None  # that is why it was chosen
+    needed, allowed = settings_of(kind.evaluate)
+    if missing := sorted(needed - set(data)):
         raise ValueError(
-            f"data lacks a setting that {kind} data need ({error}); a config of such data is "
-            f"configs/{_CONFIGS[kind]}"
-        ) from None
-    count = min(limit or count, count)
+            f"data lacks {', '.join(missing)}, which data of the kind {kind.name} need; a config "
+            f"of such data is configs/{kind.example}"
+        )
+    settings = {name: data[name] for name in allowed if name in data}
+    pairs = kind.evaluate(data["path"], cache, **settings)
+    count = min(limit or len(pairs), len(pairs))
     if not count:
-        raise ValueError(f"data: no pair in {data.path}")
-    return [_checked(make(i)) for i in tqdm(range(count), "making pairs", disable=None)]
+        raise ValueError(f"data: no pair in {data['path']}")
+    return [_checked(pairs[i]) for i in tqdm(range(count), "making pairs", disable=None)]
 
 
-def _recognized(path: str | Path) -> str:
-    layout = recognize(path)
-    if layout.kind not in _RECOGNIZED:
+def _chosen(data: Mapping[str, Any]) -> DataKind:
+    if missing := sorted({"kind", "path"} - set(data)):
+        raise ValueError(f"data lacks {', '.join(missing)}, which all data need")
+    able = [kind for kind in kinds.known() if kind.evaluate is not None]
+    if data["kind"] != "auto":
+        return kinds.named(data["kind"], "data.kind", able)
+    layout = recognize(data["path"])
+    if layout.kind not in able:
         raise ValueError(
             f"data.path: {layout}, which have no truth to measure against; wanted a list of pairs "
             "with their transforms, or a corpus (`cfr data build` makes one of meshes)"
         )
     print(f"recognized  {layout}")
-    return _RECOGNIZED[layout.kind]
-
-
-def _corpus(data: Any, cache: Path) -> tuple[int, Make]:
-    return _shapes(read_corpus(data.path), data)
-
-
-def _modelnet40(data: Any, cache: Path) -> tuple[int, Make]:
-    return _shapes(read_modelnet40(data.path, data.split), data)
-
-
-def _shapes(corpus: Corpus, data: Any) -> tuple[int, Make]:
-    if data.protocol not in _PROTOCOLS:
-        raise ValueError(
-            f"data.protocol is {data.protocol!r}, wanted one of {', '.join(_PROTOCOLS)}"
-        )
-    chosen = _PROTOCOLS[data.protocol]
-    return len(corpus), lambda index: protocol.fixed_pair(corpus, index, chosen)
-
-
-def _kitti(data: Any, cache: Path) -> tuple[int, Make]:
-    parts = [
-        kitti.read_pairs(
-            data.path,
-            sequence,
-            cache=cache / f"truths_{sequence}.npz",
-            distance=data.distance,
-            stride=data.stride or None,
-        )
-        for sequence in data.sequences
-    ]
-    chosen = data.get("frames") or None
-    places = [
-        (part, index)
-        for part in parts
-        for index, frames in enumerate(part.frames.tolist())
-        if among(chosen, frames)
-    ]
-
-    def make(index: int) -> Pair:
-        part, row = places[index]
-        return kitti.scan_pair(part, row, data.points, data.angle, data.translation)
-
-    return len(places), make
-
-
-def _pairs(data: Any, cache: Path) -> tuple[int, Make]:
-    held: Sequence[Pair] = open_pairs(data.path)
-    if not data.get("frames"):
-        return len(held), held.__getitem__
-    if not isinstance(held, Hdf5Pairs):
-        raise ValueError(f"data.frames: {data.path} does not say from which frames its pairs are")
-    rows = [row for row in range(len(held)) if among(data.frames, held.frames(row))]
-    return len(rows), lambda index: held[rows[index]]
+    return layout.kind
 
 
 def _checked(pair: Pair) -> Pair:

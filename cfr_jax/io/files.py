@@ -1,46 +1,21 @@
-"""`read` and `write`: from a path to a cloud and back."""
+"""`read` and `write`: from a path to a cloud and back.
+
+The formats come from the table `cfr_jax.io.formats`. `contents` is the one place where a file that
+a user names is opened.
+"""
 
 from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import BinaryIO
 
+from cfr_jax.io import formats
 from cfr_jax.io.cloud import CloudFileError, PointCloud
-from cfr_jax.io.formats import arrays, gltf, las, pcd, ply, surfaces, text
+from cfr_jax.io.formats import Format
 from cfr_jax.io.mesh import Mesh
 from cfr_jax.runtime.atomic import unfinished
-
-_READERS: dict[str, Callable[..., PointCloud | Mesh]] = {
-    ".ply": ply.parse,
-    ".pcd": pcd.parse,
-    ".xyz": text.parse,
-    ".txt": text.parse,
-    ".csv": text.parse,
-    ".npy": arrays.parse_npy,
-    ".npz": arrays.parse_npz,
-    ".bin": arrays.parse_velodyne,
-    ".las": las.parse,
-    ".laz": las.parse,
-    ".off": surfaces.parse_off,
-    ".obj": surfaces.parse_obj,
-    ".stl": surfaces.parse_stl,
-    ".glb": gltf.parse_glb,
-    ".gltf": gltf.parse_gltf,
-}
-SUFFIXES = tuple(_READERS)
-_WRITERS: dict[str, Callable[[BinaryIO, PointCloud], None]] = {
-    ".ply": ply.save,
-    ".pcd": pcd.save,
-    ".xyz": text.save,
-    ".txt": text.save,
-    ".npy": arrays.save_npy,
-    ".npz": arrays.save_npz,
-}
-# Documents that name other files, and so have to know where they lie.
-_NEEDS_FOLDER = (".glb", ".gltf")
 
 
 def read(path: str | os.PathLike[str], *, samples: int | None = None, seed: int = 0) -> PointCloud:
@@ -51,8 +26,7 @@ def read(path: str | os.PathLike[str], *, samples: int | None = None, seed: int 
     Coordinates keep the file's unit and frame.
 
     Args:
-        path: `.ply`, `.pcd`, `.xyz`, `.txt`, `.csv`, `.npy`, `.npz`, `.bin` (KITTI), `.las`,
-            `.laz` (needs the `io` extra), `.off`, `.obj`, `.stl`, `.glb` or `.gltf`.
+        path: a file of any format that `cfr register --help` lists.
         samples: points to draw from a surface: 10,000 if None; 0 takes the mesh's vertices
             instead. A cloud has no surface, and is not thinned by this.
         seed: of the sampling; the same seed gives the same points.
@@ -64,16 +38,25 @@ def read(path: str | os.PathLike[str], *, samples: int | None = None, seed: int 
     """
     if samples is not None and samples < 0:
         raise ValueError(f"samples must be 0 or more, got {samples}")
+    shape = read_shape(path, formats.known())
+    try:
+        return shape.points(samples, seed) if isinstance(shape, Mesh) else shape
+    except ValueError as error:
+        raise CloudFileError(f"{path}: {error}") from None
+
+
+def read_shape(path: str | os.PathLike[str], known: Iterable[Format]) -> PointCloud | Mesh:
+    """What a file of one of the `known` formats holds; a surface is not sampled yet.
+
+    Raises CloudFileError as `read` does.
+    """
     path = Path(path)
-    suffix = path.suffix.lower()
     try:
         if path.is_dir():
             raise CloudFileError("is a folder, wanted a file")
-        parse = _chosen(_READERS, suffix)
-        data = _contents(path)
-        place = (path.parent,) if suffix in _NEEDS_FOLDER else ()
-        shape = parse(data, path.name, *place)
-        return shape.points(samples, seed) if isinstance(shape, Mesh) else shape
+        form = _chosen(known, path.suffix)
+        place = (path.parent,) if form.needs_folder else ()
+        return form.parse(contents(path), path.name, *place)
     except ValueError as error:
         raise CloudFileError(f"{path}: {error}") from None
 
@@ -81,8 +64,9 @@ def read(path: str | os.PathLike[str], *, samples: int | None = None, seed: int 
 def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
     """Writes points and normals; a file of that name is replaced only once all is written.
 
-    The suffix chooses: `.ply` (binary, double), `.pcd` (binary, float), `.xyz` and `.txt`
-    (text), `.npy` ((n, 3) or (n, 6)), `.npz` (`points`, `normals`).
+    The suffix chooses the format, one of those that `cfr register --help` lists for `--out`. PLY is
+    binary in double precision, PCD binary in single; NPY holds (n, 3) or (n, 6), NPZ the arrays
+    `points` and `normals`.
 
     Raises:
         CloudFileError: the suffix is none of these, the folder cannot be written to, or the
@@ -90,22 +74,19 @@ def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
     """
     path = Path(path)
     try:
-        save = _chosen(_WRITERS, path.suffix.lower())
+        save = _chosen(formats.writable(), path.suffix).save
+        assert save is not None  # that is what writable means
         with unfinished(path) as beside, open(beside, "xb") as stream:
             save(stream, cloud)
     except OSError as error:
         raise CloudFileError(f"{path}: cannot be written: {error.strerror}") from None
-    except CloudFileError as error:
+    except ValueError as error:
         raise CloudFileError(f"{path}: {error}") from None
 
 
-def _chosen(formats: dict[str, Callable], suffix: str) -> Callable:
-    if suffix not in formats:
-        raise CloudFileError(f"unknown suffix {suffix!r}, wanted one of {' '.join(formats)}")
-    return formats[suffix]
-
-
-def _contents(path: Path) -> bytes:
+def contents(path: Path) -> bytes:
+    """All bytes of a file that a user names; raises CloudFileError, without the path, where there
+    are none or where reading might never end."""
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):  # reading a pipe or a device may never end
@@ -116,3 +97,10 @@ def _contents(path: Path) -> bytes:
     if not data:
         raise CloudFileError("is empty")
     return data
+
+
+def _chosen(known: Iterable[Format], suffix: str) -> Format:
+    held = formats.by_suffix(known)
+    if suffix.lower() not in held:
+        raise CloudFileError(f"unknown suffix {suffix.lower()!r}, wanted one of {' '.join(held)}")
+    return held[suffix.lower()]

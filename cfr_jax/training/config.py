@@ -22,7 +22,7 @@ PLACES = ("host", "device")
 class DataSection:
     """Where pairs come from: a corpus file in the layout of ModelNet40, or sources by name.
 
-    `{"street": {"kind": "kitti", "path": ..., "repeat": 4}, ...}`: `training.sources` explains the
+    `{"street": {"kind": "kitti", "path": ..., "repeat": 4}, ...}`: `data.mixture` explains the
     kinds, and checks the settings of each.
     """
 

@@ -11,9 +11,15 @@ import optax
 from jax.sharding import Mesh
 
 from cfr_jax.data.augment import Sampling
-from cfr_jax.data.loader import Mixture
 from cfr_jax.data.making.build import ENOUGH
-from cfr_jax.training import devices, optimizers, sources
+from cfr_jax.data.mixture import (
+    Mixture,
+    check_apart,
+    check_readable,
+    fixed_pairs,
+    open_mixture,
+)
+from cfr_jax.training import devices, optimizers
 from cfr_jax.training.config import Phase, TrainingConfig, checked
 from cfr_jax.training.learner import Learner, learner
 from cfr_jax.weights import files as weights
@@ -76,12 +82,12 @@ def prepare(config: TrainingConfig, workdir: Path) -> Task:
         clip=config.train.clip,
         weight_decay=config.train.weight_decay,
     )
-    mixture = sources.open_mixture(config.data.train, workdir, "data.train")
-    held_out = sources.open_mixture(config.data.validation, workdir, "data.validation")
-    sources.check_apart(mixture, held_out)
-    sources.check_readable(mixture, workdir, "data.train")
-    sources.check_readable(held_out, workdir, "data.validation")
-    pairs = sources.fixed_pairs(
+    mixture = open_mixture(config.data.train, workdir, "data.train")
+    held_out = open_mixture(config.data.validation, workdir, "data.validation")
+    check_apart(mixture, held_out)
+    check_readable(mixture, workdir, "data.train", remember=devices.is_first())
+    check_readable(held_out, workdir, "data.validation", remember=devices.is_first())
+    pairs = fixed_pairs(
         held_out,
         config.validation_pairs,
         samplings[-1],
@@ -98,8 +104,8 @@ def prepare(config: TrainingConfig, workdir: Path) -> Task:
         schedule=schedule,
         optimizer=optimizer,
         stamps={
-            "data.train": sources.stamp(mixture),
-            "data.validation": sources.stamp(held_out, pairs["transform"]),
+            "data.train": mixture.stamp(),
+            "data.validation": held_out.stamp(pairs["transform"]),
         },
         told=_told(config, mixture, held_out, len(pairs["transform"]), workdir),
     )
@@ -127,8 +133,8 @@ def fresh_params(config: TrainingConfig, chosen: Learner) -> dict:
 def _told(config, mixture, held_out, count, workdir):
     begun = config.train.start_from or "random numbers"
     told = [
-        f"training on {sources.told(mixture)}, from {begun}; "
-        f"validated on {count} pairs of {sources.told(held_out)}; all of it goes to {workdir}"
+        f"training on {mixture.told()}, from {begun}; "
+        f"validated on {count} pairs of {held_out.told()}; all of it goes to {workdir}"
     ]
     if count < ENOUGH:
         told.append(

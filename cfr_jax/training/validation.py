@@ -14,7 +14,7 @@ _RECALL = 5.0, 0.1  # degrees, and radii
 
 
 def place(batch: dict, mesh: Mesh, pairs_at_once: int = 1) -> dict:
-    """The pairs of `sources.fixed_pairs` over the devices, the last one repeated to fill them,
+    """The pairs of `mixture.fixed_pairs` over the devices, the last one repeated to fill them,
     `pairs_at_once` (or all, if they are fewer) in each."""
     count = len(batch["transform"])
     share = -(-count // mesh.size)

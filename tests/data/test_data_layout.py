@@ -6,11 +6,10 @@ import h5py
 import mesh_samples
 import numpy as np
 import pytest
-from ml_collections import ConfigDict
 
 from cfr_jax import io
 from cfr_jax.batch.jobs import jobs_of
-from cfr_jax.data import layout
+from cfr_jax.data import kinds
 from cfr_jax.data.layout import recognize
 from cfr_jax.evaluation.datasets import read_pairs
 
@@ -59,10 +58,10 @@ def make(kind, folder):
     return folder
 
 
-@pytest.mark.parametrize("kind", layout.KINDS)
+@pytest.mark.parametrize("kind", [kind.name for kind in kinds.known()])
 def test_every_kind_is_recognized_and_told(kind, tmp_path):
     found = recognize(make(kind, tmp_path))
-    assert found.kind == kind and str(tmp_path) in str(found)
+    assert found.kind.name == kind and str(tmp_path) in str(found)
     told = {
         "pair-list": "list of 2 lines", "pair-file": "2 pairs", "corpus": "corpus",
         "modelnet40": "ModelNet40", "kitti": "00 (3 scans)", "clouds": "3 point clouds",
@@ -80,8 +79,8 @@ def test_a_folder_of_ply_is_clouds_or_meshes_as_its_headers_say(tmp_path):
     (tmp_path / "m/a.ply").write_text(face)
 
     # then
-    assert recognize(tmp_path / "m").kind == "meshes"
-    assert recognize(clouds(tmp_path / "c", "a.ply")).kind == "clouds"
+    assert recognize(tmp_path / "m").kind.name == "meshes"
+    assert recognize(clouds(tmp_path / "c", "a.ply")).kind.name == "clouds"
 
 
 def test_a_readme_among_meshes_makes_no_folder_of_clouds(tmp_path):
@@ -94,11 +93,11 @@ def test_a_readme_among_meshes_makes_no_folder_of_clouds(tmp_path):
 
 def test_the_kind_can_be_overruled_but_has_to_fit(tmp_path):
     make("clouds", tmp_path)
-    assert recognize(tmp_path, "clouds").kind == "clouds"
+    assert recognize(tmp_path, "clouds").kind.name == "clouds"
     with pytest.raises(ValueError, match="not laid out as kitti: it holds 2 .ply, 1 .pcd"):
         recognize(tmp_path, "kitti")
-    with pytest.raises(ValueError, match="layout: got 'scans', wanted one of pair-list"):
-        recognize(tmp_path, "scans")
+    with pytest.raises(ValueError, match="layout: got 'photos', wanted one of pair-list"):
+        recognize(tmp_path, "photos")
 
 
 @pytest.mark.parametrize(
@@ -161,7 +160,7 @@ def test_shapes_are_no_pairs(tmp_path):
 @pytest.mark.parametrize("kind", ["pair-file", "clouds", "corpus"])
 def test_an_evaluation_recognizes_its_data(kind, tmp_path, capsys):
     # given
-    data = ConfigDict({"kind": "auto", "path": str(make(kind, tmp_path))})
+    data = {"kind": "auto", "path": str(make(kind, tmp_path))}
 
     # when, then
     if kind == "pair-file":

@@ -6,7 +6,9 @@ from oracle import pieces
 
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.corpus import Corpus
-from cfr_jax.data.loader import Mixture, ShapeSource, batch_at, batches
+from cfr_jax.data.loader import batch_at, batches
+from cfr_jax.data.mixture import Mixture
+from cfr_jax.data.sources import ShapeSource, TrainingSource
 
 SMALL = Sampling(points=24, neighbors=6)
 
@@ -91,8 +93,10 @@ def test_no_worker_is_refused(source):
         stream(source, 0, 1, workers=0)
 
 
-class Listed:
+class Listed(TrainingSource):
     """A source that tells which of its items are drawn."""
+
+    noun, stamp, recorded, check = "items", "the same", frozenset(), None
 
     def __init__(self, size):
         self.size, self.drawn = size, []

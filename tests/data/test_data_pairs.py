@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cfr_jax.data.pairs import open_pairs
+from cfr_jax.data.pairs import CsvPairs, Hdf5Pairs
 
 TRUTH = np.eye(4)
 TRUTH[:3, :3] = Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix()
@@ -31,7 +31,7 @@ def test_a_list_gives_its_pairs_with_and_without_truth(folder):
         f"{folder}/clouds/b.xyz,clouds/a.xyz\n"
     )
 
-    pairs = open_pairs(listed)
+    pairs = CsvPairs(listed)
 
     assert len(pairs) == 2
     assert pairs.names[0] == "clouds/a.xyz -> clouds/b.xyz"
@@ -47,7 +47,7 @@ def test_a_list_is_checked_before_any_cloud_is_read(folder):
     listed = folder / "pairs.csv"
     listed.write_text("absent.ply,missing.ply\n")
 
-    pairs = open_pairs(str(listed))
+    pairs = CsvPairs(str(listed))
 
     assert pairs.names == ("absent.ply -> missing.ply",)
     with pytest.raises((ValueError, OSError), match="absent.ply"):
@@ -71,7 +71,7 @@ def test_a_bad_line_is_named_by_its_number(folder, line, message):
     listed.write_text(f"source,target\n{line}\n")
 
     with pytest.raises(ValueError, match=message):
-        open_pairs(listed)
+        CsvPairs(listed)
 
 
 def test_a_reflection_is_not_taken_for_a_motion(folder):
@@ -79,7 +79,7 @@ def test_a_reflection_is_not_taken_for_a_motion(folder):
     (folder / "pairs.csv").write_text("a.ply,b.ply," + ",".join(map(str, mirror.ravel())))
 
     with pytest.raises(ValueError, match="R is a reflection"):
-        open_pairs(folder / "pairs.csv")
+        CsvPairs(folder / "pairs.csv")
 
 
 def test_groups_of_an_hdf5_file_are_its_pairs_in_the_order_of_their_names(tmp_path):
@@ -91,7 +91,7 @@ def test_groups_of_an_hdf5_file_are_its_pairs_in_the_order_of_their_names(tmp_pa
         file["pair_0/source_normals"] = clouds[0]
         file["pair_0/transform"], file["pair_0/overlap"] = TRUTH, 0.4
 
-    pairs = open_pairs(tmp_path / "pairs.h5")
+    pairs = Hdf5Pairs(tmp_path / "pairs.h5")
 
     assert pairs.names == ("pair_0", "pair_1")
     full, bare = pairs
@@ -129,19 +129,19 @@ def test_a_bad_group_is_named(tmp_path, held, message):
             file[f"only/{key}"] = value
 
     with pytest.raises(ValueError, match=f"only.*{message}"):
-        open_pairs(tmp_path / "pairs.h5")[0]
+        Hdf5Pairs(tmp_path / "pairs.h5")[0]
 
 
 def test_what_is_no_list_of_pairs_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="no list of pairs at"):
-        open_pairs(tmp_path / "absent.csv")
+    with pytest.raises(ValueError, match="no file of pairs at"):
+        CsvPairs(tmp_path / "absent.csv")
     (tmp_path / "empty.csv").write_text("source,target\n")
     with pytest.raises(ValueError, match="lists no pair"):
-        open_pairs(tmp_path / "empty.csv")
+        CsvPairs(tmp_path / "empty.csv")
     (tmp_path / "noise.csv").write_bytes(bytes(range(255, 0, -1)))
-    with pytest.raises(ValueError, match="neither CSV nor HDF5"):
-        open_pairs(tmp_path / "noise.csv")
+    with pytest.raises(ValueError, match="no list in CSV"):
+        CsvPairs(tmp_path / "noise.csv")
     with h5py.File(tmp_path / "flat.h5", "w") as file:
         file["data"] = np.ones(3)
     with pytest.raises(ValueError, match="holds no group"):
-        open_pairs(tmp_path / "flat.h5")
+        Hdf5Pairs(tmp_path / "flat.h5")

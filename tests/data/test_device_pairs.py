@@ -15,7 +15,7 @@ from scipy.stats import ks_2samp
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.device_pairs import Shapes, draw_pairs
-from cfr_jax.data.loader import ShapeSource
+from cfr_jax.data.sources import ShapeSource
 from cfr_jax.geometry.neighbors import nearest_on_host
 
 PAIRS = 700

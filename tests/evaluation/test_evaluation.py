@@ -238,7 +238,7 @@ def test_pairs_of_a_corpus_are_those_of_its_fixed_protocol(tmp_path, kind):
 
     # given
     path = a_corpus(tmp_path / "test.h5")
-    data = ConfigDict({"kind": "corpus", "path": str(path), "protocol": kind})
+    data = {"kind": "corpus", "path": str(path), "protocol": kind}
 
     # when
     pairs = read_pairs(data, 3, tmp_path)
@@ -254,8 +254,8 @@ def test_pairs_of_a_corpus_are_those_of_its_fixed_protocol(tmp_path, kind):
 @pytest.mark.parametrize(
     ("change", "limit", "message"),
     [
-        ({"kind": "movies"}, 1, "data.kind is 'movies', wanted auto or one of corpus, modelnet40"),
-        ({"protocol": "hard"}, 1, "data.protocol is 'hard', wanted one of clean, noise, partial"),
+        ({"kind": "movies"}, 1, "data.kind: got 'movies', wanted one of pair-list, pair-file"),
+        ({"protocol": "hard"}, 1, "protocol: got 'hard', wanted one of clean, noise, partial"),
         ({"path": "nowhere.h5"}, 1, "no corpus at nowhere.h5"),
         ({"kind": "modelnet40", "path": "nowhere", "split": "test"}, 1, "Get modelnet40_ply"),
         ({}, -1, "limit is -1"),
@@ -264,7 +264,7 @@ def test_pairs_of_a_corpus_are_those_of_its_fixed_protocol(tmp_path, kind):
 def test_data_that_cannot_be_used_is_told(tmp_path, change, limit, message):
     data = {"kind": "corpus", "path": str(a_corpus(tmp_path / "t.h5")), "protocol": "partial"}
     with pytest.raises(ValueError, match=message):
-        read_pairs(ConfigDict(data | change), limit, tmp_path)
+        read_pairs(data | change, limit, tmp_path)
 
 
 def test_pairs_of_some_frames_are_those_whose_both_frames_are_among_them(tmp_path):
@@ -275,10 +275,10 @@ def test_pairs_of_some_frames_are_those_whose_both_frames_are_among_them(tmp_pat
             group["source"], group["target"], group["transform"] = points, points, np.eye(4)
             if frames is not None:
                 group.attrs["source_frame"], group.attrs["target_frame"] = frames
-    data = ConfigDict({"kind": "pairs", "path": str(tmp_path / "pairs.h5"), "frames": (3, 9)})
+    data = {"kind": "pair-file", "path": str(tmp_path / "pairs.h5"), "frames": (3, 9)}
 
     assert [pair.name for pair in read_pairs(data, 0, tmp_path)] == ["b"]
-    data.frames = ()
+    data["frames"] = ()
     assert len(read_pairs(data, 0, tmp_path)) == 4
 
 
@@ -308,7 +308,7 @@ def test_the_code_of_a_network_is_told_apart_by_every_file_that_makes_its_answer
 def test_a_pair_without_truth_cannot_be_measured(tmp_path):
     with h5py.File(tmp_path / "pairs.h5", "w") as file:
         file["a/source"] = file["a/target"] = np.random.default_rng(0).normal(size=(9, 3))
-    data = ConfigDict({"kind": "pairs", "path": str(tmp_path / "pairs.h5")})
+    data = {"kind": "pair-file", "path": str(tmp_path / "pairs.h5")}
     with pytest.raises(ValueError, match="pair a has no true transform"):
         read_pairs(data, 0, tmp_path)
 

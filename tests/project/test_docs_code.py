@@ -22,7 +22,7 @@ import jax
 import pytest
 
 from cfr_jax import cli, io
-from cfr_jax.data.pairs import open_pairs
+from cfr_jax.data.pairs import CsvPairs
 
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "cfr_jax" / "cli" / "demo_pair"
@@ -113,7 +113,7 @@ def test_the_pairs_that_a_page_lists_are_pairs(tmp_path):
     (line,) = [line for line in page.splitlines() if line.count(",") == 17]
     (tmp_path / "listed.csv").write_text(line)
 
-    assert len(open_pairs(tmp_path / "listed.csv")) == 1
+    assert len(CsvPairs(tmp_path / "listed.csv")) == 1
 
 
 def with_blocks(select) -> list[str]:

@@ -68,11 +68,11 @@ def test_fields_of_every_section_can_be_set_by_flags():
 def test_flags_replace_the_phases_and_the_sources_as_a_whole(unchecked):
     found = from_command(
         "own_scans.py", "--config.data.validation=val.h5",
-        """--config.data.train={"a": {"kind": "scans", "path": "b"}}""",
+        """--config.data.train={"a": {"kind": "clouds", "path": "b"}}""",
         """--config.phases=({"steps": 5, "points": 512, "neighbors": 32, "batch": 8},)""",
     )  # fmt: skip
 
-    assert found.data.train == {"a": {"kind": "scans", "path": "b"}}
+    assert found.data.train == {"a": {"kind": "clouds", "path": "b"}}
     assert found.data.validation == "val.h5"
     assert found.phases == (Phase(steps=5, points=512, neighbors=32, batch=8),)
 
@@ -82,7 +82,7 @@ def test_flags_set_the_fields_of_a_source_by_its_name():
         "own_scans.py", "--config.data.train.scans.path=mine", "--config.data.train.pairs.repeat=2"
     )
 
-    assert found.data.train["scans"] == {"kind": "scans", "path": "mine", "repeat": 1}
+    assert found.data.train["scans"] == {"kind": "clouds", "path": "mine", "repeat": 1}
     assert found.data.train["pairs"]["repeat"] == 2
     assert found.data.validation["scans"]["path"] == ""
 

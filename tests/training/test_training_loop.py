@@ -423,10 +423,10 @@ def test_neighbors_are_trained_on_within_the_radius_that_is_validated(corpus_fil
 
 
 def test_validation_measures_the_last_transform(corpus_file, monkeypatch):
-    from cfr_jax.training import sources
+    from cfr_jax.data import mixture
 
-    held_out = sources.open_mixture(str(corpus_file), corpus_file.parent, "data.validation")
-    pairs = sources.fixed_pairs(held_out, 3, Sampling(points=24, neighbors=6), 64, 0.3)
+    held_out = mixture.open_mixture(str(corpus_file), corpus_file.parent, "data.validation")
+    pairs = mixture.fixed_pairs(held_out, 3, Sampling(points=24, neighbors=6), 64, 0.3)
     assert pairs["source"].shape == (3, 717, 3)
     assert pairs["source_neighbors"].shape == (3, 717, 64)
     off = np.array(pairs["transform"], np.float32)[:, None].repeat(2, axis=1)

@@ -14,7 +14,9 @@ from training_samples import BATCH, NEIGHBORS, POINTS, assert_same, fresh, recip
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.corpus import Corpus, read_corpus
 from cfr_jax.data.device_pairs import Shapes, draw_pairs
-from cfr_jax.data.loader import Mixture, ShapeSource, items_at
+from cfr_jax.data.loader import items_at
+from cfr_jax.data.mixture import Mixture
+from cfr_jax.data.sources import ShapeSource
 from cfr_jax.training import devices, learner, loop, optimizers, step, validation
 from cfr_jax.training.checkpoints import Checkpoints
 from cfr_jax.training.config import Phase, TrainSection

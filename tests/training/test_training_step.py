@@ -12,7 +12,8 @@ from training_samples import BATCH, NEIGHBORS, POINTS, assert_same, fresh, recip
 
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.corpus import read_corpus
-from cfr_jax.data.loader import ShapeSource, batch_at
+from cfr_jax.data.loader import batch_at
+from cfr_jax.data.sources import ShapeSource
 from cfr_jax.networks.cfr import iterations
 from cfr_jax.networks.cfr import modules as network
 from cfr_jax.training import devices

@@ -9,14 +9,19 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cfr_jax.io import formats
+
 if TYPE_CHECKING:
     from cfr_jax.viewer import Scene
 
-# What `cfr_jax.io.write` can write; a test holds the two together.
-CLOUD_SUFFIXES = (".ply", ".pcd", ".xyz", ".txt", ".npy", ".npz")
 PAGE_SUFFIXES = (".html", ".htm")
 PICTURE_SUFFIXES = (".png",)
 RECORDING_SUFFIXES = (".rrd",)
+
+
+def cloud_suffixes() -> tuple[str, ...]:
+    """What `cfr_jax.io.write` writes."""
+    return tuple(formats.by_suffix(formats.writable()))
 
 
 def check_output(option: str, path: Path, suffixes: tuple[str, ...] = ()) -> None:

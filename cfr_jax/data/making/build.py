@@ -16,9 +16,11 @@ import h5py
 import numpy as np
 
 from cfr_jax.data.making.duplicates import drop_duplicates
-from cfr_jax.data.making.meshes import SUFFIXES, read_mesh
+from cfr_jax.data.making.mesh_formats import mesh_formats
+from cfr_jax.data.making.meshes import read_mesh
 from cfr_jax.data.making.samples import RECIPE, Item, sampled
 from cfr_jax.data.making.shapes import Shape, name_share
+from cfr_jax.io.formats import by_suffix
 from cfr_jax.runtime.atomic import unfinished, write_atomically
 from cfr_jax.runtime.progress import Progress
 
@@ -55,11 +57,12 @@ def folder_items(folder: Path, least_faces: int = 20) -> list[Item]:
     """
     if not folder.is_dir():
         raise ValueError(f"no folder {folder} to take meshes from")
+    suffixes = by_suffix(mesh_formats())
     paths = sorted(
-        path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()
+        path for path in folder.rglob("*") if path.suffix.lower() in suffixes and path.is_file()
     )
     if not paths:
-        raise ValueError(f"no mesh below {folder}: wanted files that end in {' '.join(SUFFIXES)}")
+        raise ValueError(f"no mesh below {folder}: wanted files that end in {' '.join(suffixes)}")
     items = []
     for path in paths:
         inside = path.relative_to(folder)

@@ -6,14 +6,14 @@ PMD (0 A.D.) and AC3D (FlightGear) are parsed here; common formats by `cfr_jax.i
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from cfr_jax.data.making.mesh_formats import mesh_formats
 from cfr_jax.geometry import motions
-from cfr_jax.io.formats import gltf, ply, surfaces
+from cfr_jax.io.files import read_shape
 from cfr_jax.io.mesh import Mesh, fan_triangles
 
 _PMD_START = struct.Struct("<4sIIII")  # mark, version, size of the rest, vertices, texture sets
@@ -178,37 +178,12 @@ class _Ac3d:
         raise ValueError(f"{self._name}: line {self._at}: {message}")
 
 
-def _whole(parse: Callable[[bytes, str], object]) -> Callable[[bytes, str, Path], object]:
-    return lambda data, name, folder: parse(data, name)
-
-
-_PARSERS: dict[str, Callable[[bytes, str, Path], object]] = {
-    ".off": _whole(surfaces.parse_off),
-    ".obj": _whole(surfaces.parse_obj),
-    ".stl": _whole(surfaces.parse_stl),
-    ".ply": _whole(ply.parse),
-    ".glb": gltf.parse_glb,
-    ".gltf": gltf.parse_gltf,
-    ".pmd": _whole(parse_pmd),
-    ".ac": _whole(parse_ac3d),
-}
-SUFFIXES = tuple(_PARSERS)
-
-
 def read_mesh(path: Path) -> Mesh:
-    """The triangles of a file, its format told by the suffix (one of `SUFFIXES`).
+    """The triangles of a file, its format told by the suffix (one of `mesh_formats`).
 
     Raises ValueError where the file cannot be read, or holds points and no faces.
     """
-    suffix = path.suffix.lower()
-    if suffix not in _PARSERS:
-        raise ValueError(f"{path}: unknown suffix {suffix!r}, wanted one of {' '.join(SUFFIXES)}")
-    try:
-        mesh = _PARSERS[suffix](path.read_bytes(), path.name, path.parent)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    mesh = read_shape(path, mesh_formats())
     if not isinstance(mesh, Mesh):
         raise ValueError(f"{path}: is a point cloud, wanted a mesh with faces")
     return mesh

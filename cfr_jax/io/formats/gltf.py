@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from cfr_jax.io.cloud import CloudFileError, as_float64
+from cfr_jax.io.files import contents
 from cfr_jax.io.mesh import Mesh
 
 T = TypeVar("T")
@@ -191,7 +192,10 @@ class _Scene:
         """A buffer in a file of its own; a document may not name files of other folders."""
         if "\0" in uri or Path(uri).name != uri or not (self.folder / uri).is_file():
             raise CloudFileError(f"buffer {index}: wanted a file {uri[:80]!r} in the same folder")
-        return (self.folder / uri).read_bytes()
+        try:
+            return contents(self.folder / uri)
+        except CloudFileError as error:
+            raise CloudFileError(f"buffer {index}: {uri[:80]!r} {error}") from None
 
     def _item(self, key: str, index: Any) -> dict:
         items = _get(self.document, key, list)

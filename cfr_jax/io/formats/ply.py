@@ -6,6 +6,7 @@ makes them allocate it, and damaged lists raise whatever comes.
 
 from __future__ import annotations
 
+import re
 from typing import BinaryIO
 
 import numpy as np
@@ -17,6 +18,7 @@ from cfr_jax.io.mesh import Mesh, fan_triangles
 
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 16
+_FACES = re.compile(rb"element\s+(?:face|tristrips)\s+(\d+)")
 
 
 def parse(data: bytes, name: str) -> PointCloud | Mesh:
@@ -40,6 +42,12 @@ def parse(data: bytes, name: str) -> PointCloud | Mesh:
     if "face" in lists:
         return Mesh(points, fan_triangles(*lists["face"]), name, normals)
     return PointCloud(points, normals, name)
+
+
+def has_faces(start: bytes) -> bool:
+    """Whether the header, or as much of it as is in the first bytes, counts any face."""
+    match = _FACES.search(start.partition(b"end_header")[0])
+    return match is not None and int(match[1]) > 0
 
 
 def _parse_header(data: bytes) -> tuple[str, list[Element], int]:

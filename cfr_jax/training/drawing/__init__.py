@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 from jax.sharding import Mesh
 
 from cfr_jax.data.augment import Sampling
-from cfr_jax.data.loader import Mixture
+from cfr_jax.data.mixture import Mixture
 from cfr_jax.training.config import Phase, TrainingConfig
 from cfr_jax.training.losses import PairLoss
 from cfr_jax.training.step import Recipe, TrainState

@@ -14,7 +14,9 @@ from jax.sharding import Mesh
 
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.device_pairs import Shapes
-from cfr_jax.data.loader import Mixture, ShapeSource, items_at
+from cfr_jax.data.loader import items_at
+from cfr_jax.data.mixture import Mixture
+from cfr_jax.data.sources import ShapeSource
 from cfr_jax.training import devices, step
 from cfr_jax.training.config import TrainingConfig
 from cfr_jax.training.drawing import Leg, Stretch

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 from jax.sharding import Mesh
 
-from cfr_jax.data.loader import Mixture, batches
+from cfr_jax.data.loader import batches
+from cfr_jax.data.mixture import Mixture
 from cfr_jax.training import devices, step
 from cfr_jax.training.config import TrainingConfig
 from cfr_jax.training.drawing import Leg, Stretch

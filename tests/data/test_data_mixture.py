@@ -1,18 +1,22 @@
 """Training data by name: shapes, pairs of scans, drives, single scans, and mixtures of them."""
 
+from pathlib import Path
+
 import h5py
 import numpy as np
 import pytest
-from ml_collections import ConfigDict
 from oracle import pieces
 from scipy.spatial.transform import Rotation
 
 from cfr_jax import io
+from cfr_jax.data import mixture as mixtures
+from cfr_jax.data import scenes
 from cfr_jax.data.augment import Sampling
+from cfr_jax.data.kinds import clouds, kitti, pair_file, pair_list
 from cfr_jax.data.pairs import Pair
-from cfr_jax.training import scenes, sources
 
 FAR = np.array([5e6, -2e6, 100.0])  # map coordinates, meters
+NO_CACHE = Path("none is needed")
 WHOLE = Sampling(
     points=60, neighbors=6, keep=(1.0, 1.0), noise=(0.0, 0.0), angle=45.0, translation=0.1
 )
@@ -50,7 +54,7 @@ def pairs_file(tmp_path_factory, surface, motion):
 
 
 def test_the_truth_of_a_drawn_pair_lays_one_scan_on_the_other(pairs_file):
-    source = scenes.pairs_source(pairs_file)
+    source = pair_file.train(pairs_file, NO_CACHE)
 
     for seed in range(3):
         pair = source.draw(1, WHOLE, np.random.default_rng(seed))
@@ -69,7 +73,7 @@ def test_a_pair_with_all_its_points_is_laid_exactly(pairs_file):
         scale=(0.5, 2.0),
     )  # fmt: skip
 
-    pair = scenes.pairs_source(pairs_file).draw(0, sampling, np.random.default_rng(0))
+    pair = pair_file.train(pairs_file, NO_CACHE).draw(0, sampling, np.random.default_rng(0))
 
     moved = pieces.move(pair["transform"].astype(np.float64), pair["source"])
     gap = np.linalg.norm(moved[:, None] - pair["target"], axis=-1).min(axis=1)
@@ -77,7 +81,7 @@ def test_a_pair_with_all_its_points_is_laid_exactly(pairs_file):
 
 
 def test_the_same_seed_draws_the_same_pair(pairs_file):
-    source = scenes.pairs_source(pairs_file)
+    source = pair_file.train(pairs_file, NO_CACHE)
 
     first, second = (source.draw(2, WHOLE, np.random.default_rng(4)) for _ in range(2))
 
@@ -86,31 +90,27 @@ def test_the_same_seed_draws_the_same_pair(pairs_file):
 
 
 def test_frames_choose_the_pairs_that_lie_within_them(pairs_file):
-    assert scenes.pairs_source(pairs_file, (0, 4)).names == ("pair_0", "pair_1")
-    assert scenes.pairs_source(pairs_file, (3, 9)).names == ("pair_2", "pair_3")
+    assert pair_file.train(pairs_file, NO_CACHE, frames=(0, 4)).names == ("pair_0", "pair_1")
+    assert pair_file.train(pairs_file, NO_CACHE, frames=(3, 9)).names == ("pair_2", "pair_3")
     with pytest.raises(ValueError, match="some within `frames`"):
-        scenes.pairs_source(pairs_file, (100, 200))
-
-
-def given(**named):
-    return ConfigDict(named)
+        pair_file.train(pairs_file, NO_CACHE, frames=(100, 200))
 
 
 def test_scans_that_are_validated_on_must_not_be_trained_on(pairs_file, tmp_path):
     def opened(frames):
-        about = {"kind": "pairs", "path": str(pairs_file), "frames": frames}
-        return sources.open_mixture(given(room=about), tmp_path, "data.train")
+        about = {"kind": "pair-file", "path": str(pairs_file), "frames": frames}
+        return mixtures.open_mixture({"room": about}, tmp_path, "data.train")
 
-    sources.check_apart(opened((0, 6)), opened((6, 12)))
+    mixtures.check_apart(opened((0, 6)), opened((6, 12)))
     with pytest.raises(ValueError, match="2 of its 6 scans are in data.train, too"):
-        sources.check_apart(opened((0, 8)), opened((6, 12)))
+        mixtures.check_apart(opened((0, 8)), opened((6, 12)))
 
 
 def test_single_scans_make_pairs_of_their_own(tmp_path, surface):
     for name in ("a.ply", "b.xyz"):
         io.write(tmp_path / name, io.PointCloud(surface))
 
-    source = scenes.scans_source(tmp_path)
+    source = clouds.train(tmp_path, NO_CACHE)
 
     assert source.names == ("a.ply", "b.xyz")
     sampling = Sampling(points=300, neighbors=6, keep=(0.6, 0.7), noise=(0.0, 0.0), translation=0.0)
@@ -126,14 +126,14 @@ def test_a_list_of_files_trains_too_and_needs_truths(tmp_path, surface, motion):
     numbers = ",".join(map(repr, motion.ravel().tolist()))
     (tmp_path / "train.csv").write_text(f"source.ply,target.ply,{numbers}\nsource.ply,target.ply\n")
 
-    source = scenes.pairs_source(tmp_path / "train.csv")
+    source = pair_list.train(tmp_path / "train.csv", NO_CACHE)
 
     pair = source.draw(0, WHOLE, np.random.default_rng(0))
     assert pair["transform"].shape == (4, 4)
     with pytest.raises(ValueError, match="no true transform to learn from"):
         source.draw(1, WHOLE, np.random.default_rng(0))
     with pytest.raises(ValueError, match="does not say from which frames"):
-        scenes.pairs_source(tmp_path / "train.csv", (0, 5))
+        pair_list.train(tmp_path / "train.csv", NO_CACHE, frames=(0, 5))
 
 
 @pytest.fixture(scope="module")
@@ -160,9 +160,7 @@ def drive(tmp_path_factory):
 
 
 def test_a_drive_gives_pairs_at_several_distances_within_its_frames(drive, tmp_path):
-    source = scenes.kitti_source(
-        drive, cache=tmp_path, distances=(3.0, 5.0), frames=(0, 7), stride=2
-    )
+    source = kitti.train(drive, tmp_path, distances=(3.0, 5.0), frames=(0, 7), stride=2)
 
     assert source.names == ("00/000000-000002", "00/000002-000004", "00/000004-000006",
                             "00/000000-000003", "00/000002-000005")  # fmt: skip
@@ -182,14 +180,14 @@ def test_of_a_single_scan_two_views_are_validated_on_and_a_recorded_pair_as_it_i
     sampling = Sampling(points=300, neighbors=20, keep=(0.5, 0.6), noise=(0.0, 0.0))
 
     def shared(**about):
-        held = sources.open_mixture(given(room=about), tmp_path, "data.validation")
-        pairs = sources.fixed_pairs(held, 1, sampling, 20, 0.3)
+        held = mixtures.open_mixture({"room": about}, tmp_path, "data.validation")
+        pairs = mixtures.fixed_pairs(held, 1, sampling, 20, 0.3)
         moved = pieces.move(pairs["transform"][0].astype(np.float64), pairs["source"][0])
         gap = np.linalg.norm(moved[:, None] - pairs["target"][0], axis=-1).min(axis=1)
         return (gap < 1e-3).mean()
 
-    assert shared(kind="scans", path=str(tmp_path)) < 0.9
-    assert shared(kind="pairs", path=str(pairs_file)) > 0.98
+    assert shared(kind="clouds", path=str(tmp_path)) < 0.9
+    assert shared(kind="pair-file", path=str(pairs_file)) > 0.98
 
 
 def test_scans_that_cannot_be_read_are_all_named_before_any_training(tmp_path, surface):
@@ -201,20 +199,20 @@ def test_scans_that_cannot_be_read_are_all_named_before_any_training(tmp_path, s
     (scans / "c.txt").write_text("hello\n")
 
     def opened():
-        about = {"kind": "scans", "path": str(scans)}
-        return sources.open_mixture(given(mine=about), cache, "data.train")
+        about = {"kind": "clouds", "path": str(scans)}
+        return mixtures.open_mixture({"mine": about}, cache, "data.train")
 
     with pytest.raises(
         ValueError, match=r"data.train: 2 scans cannot be used.*\n.*b\.ply.*\n.*c\.txt"
     ):
-        sources.check_readable(opened(), cache, "data.train")
+        mixtures.check_readable(opened(), cache, "data.train")
     for name in ("b.ply", "c.txt"):
         (scans / name).unlink()
     mixture = opened()
-    sources.check_readable(mixture, cache, "data.train")
+    mixtures.check_readable(mixture, cache, "data.train")
     reads = mixture.sources[0].read.cache_info().misses
     again = opened()
-    sources.check_readable(again, cache, "data.train")
+    mixtures.check_readable(again, cache, "data.train")
     assert reads == 1 and again.sources[0].read.cache_info().misses == 0  # remembered
 
 
@@ -226,14 +224,14 @@ def test_scans_of_too_few_points_are_named_before_any_training(tmp_path, surface
         (scans / folder).mkdir()
         io.write(scans / folder / "few.ply", io.PointCloud(surface[:3]))
     io.write(scans / "same.ply", io.PointCloud(np.ones((500, 3))))
-    about = {"kind": "scans", "path": str(scans)}
-    mixture = sources.open_mixture(given(mine=about), tmp_path, "data.train")
+    about = {"kind": "clouds", "path": str(scans)}
+    mixture = mixtures.open_mixture({"mine": about}, tmp_path, "data.train")
 
     with pytest.raises(
         ValueError,
         match=r"3 scans .*\n.*a/few\.ply has 3 .*\n.*b/few\.ply has 3 .*\n.*same\.ply has 500",
     ):
-        sources.check_readable(mixture, tmp_path, "data.train")
+        mixtures.check_readable(mixture, tmp_path, "data.train")
 
 
 def test_a_pair_that_cannot_be_drawn_is_named():
@@ -250,7 +248,7 @@ def test_of_a_scan_of_many_points_only_some_are_held(tmp_path):
     points = rng.normal(size=(3 * scenes._MOST, 3))
     io.write(tmp_path / "big.ply", io.PointCloud(points, normals=points))
 
-    pair = scenes.scans_source(tmp_path).read(0)
+    pair = clouds.train(tmp_path, NO_CACHE).read(0)
 
     assert pair.source.shape == pair.source_normals.shape == (scenes._MOST, 3)
     directions = pair.source / np.linalg.norm(pair.source, axis=1, keepdims=True)
@@ -264,8 +262,8 @@ def test_the_stamp_of_data_goes_by_what_they_are_and_not_by_where_they_lie(tmp_p
         (tmp_path / folder).mkdir()
         for name, cloud in clouds.items():
             io.write(tmp_path / folder / name, io.PointCloud(cloud))
-        about = {"kind": "scans", "path": str(tmp_path / folder), "repeat": repeat}
-        return sources.stamp(sources.open_mixture(given(a=about), tmp_path, "data.train"))
+        about = {"kind": "clouds", "path": str(tmp_path / folder), "repeat": repeat}
+        return mixtures.open_mixture({"a": about}, tmp_path, "data.train").stamp()
 
     first = stamp("one", {"a.ply": surface})
     assert first.startswith("1 single scans, ")
@@ -283,22 +281,22 @@ def test_lists_share_a_scan_where_they_name_one_file(tmp_path, surface, motion):
     (tmp_path / "val.csv").write_text(f"c.ply,./b.ply,{numbers}\n")
 
     def opened(name):
-        about = {"kind": "pairs", "path": str(tmp_path / name)}
-        return sources.open_mixture(given(a=about), tmp_path, "data.train")
+        about = {"kind": "pair-list", "path": str(tmp_path / name)}
+        return mixtures.open_mixture({"a": about}, tmp_path, "data.train")
 
     with pytest.raises(ValueError, match="1 of its 2 scans are in data.train, too"):
-        sources.check_apart(opened("train.csv"), opened("val.csv"))
-    about = {"kind": "scans", "path": str(tmp_path)}
-    folder = sources.open_mixture(given(a=about), tmp_path, "data.validation")
+        mixtures.check_apart(opened("train.csv"), opened("val.csv"))
+    about = {"kind": "clouds", "path": str(tmp_path)}
+    folder = mixtures.open_mixture({"a": about}, tmp_path, "data.validation")
     with pytest.raises(ValueError, match="2 of its 3 scans are in data.train, too"):
-        sources.check_apart(opened("train.csv"), folder)
+        mixtures.check_apart(opened("train.csv"), folder)
 
 
 def test_named_sources_are_mixed_as_often_as_told(pairs_file, tmp_path):
-    mixture = sources.open_mixture(
-        given(
-            room={"kind": "pairs", "path": str(pairs_file), "repeat": 3},
-            out={"kind": "scans", "path": "nowhere", "repeat": 0},
+    mixture = mixtures.open_mixture(
+        dict(
+            room={"kind": "pair-file", "path": str(pairs_file), "repeat": 3},
+            out={"kind": "clouds", "path": "nowhere", "repeat": 0},
         ),
         tmp_path,
         "data.train",
@@ -308,11 +306,11 @@ def test_named_sources_are_mixed_as_often_as_told(pairs_file, tmp_path):
 
 
 def test_validation_pairs_are_the_same_every_time(pairs_file, tmp_path):
-    about = {"kind": "pairs", "path": str(pairs_file), "repeat": 2}
-    held = sources.open_mixture(given(room=about), tmp_path, "data.validation")
+    about = {"kind": "pair-file", "path": str(pairs_file), "repeat": 2}
+    held = mixtures.open_mixture({"room": about}, tmp_path, "data.validation")
 
     sampling = Sampling(points=40, neighbors=6, keep=(0.5, 0.5))
-    first, second = (sources.fixed_pairs(held, 10, sampling, 64, 0.3) for _ in range(2))
+    first, second = (mixtures.fixed_pairs(held, 10, sampling, 64, 0.3) for _ in range(2))
 
     assert first["source"].shape == (6, 40, 3) and first["source_neighbors"].shape == (6, 40, 39)
     for key in first:
@@ -323,14 +321,14 @@ def test_validation_pairs_are_the_same_every_time(pairs_file, tmp_path):
     ("about", "wanted"),
     [
         ({"kind": "video", "path": "a"}, "kind: got 'video'"),
-        ({"kind": "scans", "path": "nowhere"}, "no folder of scans at nowhere"),
-        ({"kind": "scans", "path": "a", "frames": (0, 1)}, "scans got .*frames.*wanted path"),
-        ({"kind": "pairs"}, "wanted path"),
-        ({"kind": "scans", "path": ""}, "data.train.mine.path: none given"),
-        ({"kind": "pairs", "path": "a", "repeat": -1}, "repeat: got -1"),
-        ({"kind": "pairs", "path": "a", "repeat": 0}, "no source"),
+        ({"kind": "clouds", "path": "nowhere"}, "no folder of scans at nowhere"),
+        ({"kind": "clouds", "path": "a", "frames": (0, 1)}, "clouds got .*frames.*wanted path"),
+        ({"kind": "pair-list"}, "data.train.mine.path: none given"),
+        ({"kind": "clouds", "path": ""}, "data.train.mine.path: none given"),
+        ({"kind": "pair-list", "path": "a", "repeat": -1}, "repeat: got -1"),
+        ({"kind": "pair-list", "path": "a", "repeat": 0}, "no source"),
     ],
 )
 def test_what_a_source_has_wrong_is_named(tmp_path, about, wanted):
     with pytest.raises(ValueError, match=wanted):
-        sources.open_mixture(given(mine=about), tmp_path, "data.train")
+        mixtures.open_mixture({"mine": about}, tmp_path, "data.train")

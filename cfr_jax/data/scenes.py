@@ -1,4 +1,4 @@
-"""Training pairs from scans: pairs with a known motion, frames of a drive, or single scans.
+"""Training pairs from scans: pairs with a known motion, or single scans.
 
 Every pair is brought to the network as `align` does it: each cloud about its own centroid, both in
 the unit sphere, thinned evenly. Scans without normals have them estimated.
@@ -6,6 +6,7 @@ the unit sphere, thinned evenly. Scans without normals have them estimated.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 from collections.abc import Callable, Hashable, Sequence
@@ -16,18 +17,16 @@ import numpy as np
 from jaxtyping import Float
 
 from cfr_jax import io
-from cfr_jax.data import kitti
 from cfr_jax.data.augment import Sampling, View, choose_rows, finish_pair
-from cfr_jax.data.layout import CLOUD_SUFFIXES, loose_files, scans_of
-from cfr_jax.data.pairs import CsvPairs, Hdf5Pairs, Pair, among, open_pairs
+from cfr_jax.data.pairs import Pair
 from cfr_jax.data.protocol import crop
 from cfr_jax.geometry import units
+from cfr_jax.io import formats
+from cfr_jax.io.formats import by_suffix
 
 _HELD = 128  # pairs in memory: reading one takes longer than drawing from it
 _MOST = 1 << 16  # points of a cloud in memory, drawn at random: scans of any size then fit
 _FEWEST = 16  # points that differ: of fewer, crops and neighborhoods are no surfaces
-Frames = tuple[int, int] | None
-"""Only pairs whose frames both are at least the first and below the second; None: all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +46,21 @@ class SceneSource:
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def noun(self) -> str:
+        """What the items are called."""
+        return "single scans" if self.single else "pairs of scans"
+
+    @property
+    def recorded(self) -> frozenset[Hashable]:
+        """All that any item was recorded from."""
+        return frozenset(frame for item in self.frames for frame in item)
+
+    @property
+    def check(self) -> Callable[[int], object]:
+        """Items are read when they are drawn; `read` finds the bad ones before."""
+        return self.read
+
     def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
         """A crop and a draw of points of each cloud, in the unit sphere."""
         pair = self.read(index)
@@ -54,6 +68,31 @@ class SceneSource:
             return self._draw(pair, sampling, rng)
         except ValueError as error:
             raise ValueError(f"{self.names[index]}: {error}") from error
+
+    def fixed_pair(
+        self,
+        index: int,
+        sampling: Sampling,
+        neighbors: int,
+        radius: float,
+        rng: np.random.Generator,
+    ) -> dict:
+        """A recorded pair as it is, thinned to `sampling.points` and turned by up to 45 degrees
+        about each axis. Of a single scan two views are drawn by `sampling`, as in training: whole,
+        it would be laid on itself."""
+        fewer = min(neighbors, sampling.points - 1)
+        if self.single:
+            chosen = dataclasses.replace(sampling, neighbors=fewer, radius=radius)
+        else:
+            chosen = Sampling(
+                points=sampling.points,
+                neighbors=fewer,
+                radius=radius,
+                keep=(1.0, 1.0),
+                translation=0.1,
+                noise=(0.0, 0.0),
+            )
+        return self.draw(index, chosen, rng)
 
     def _draw(self, pair: Pair, sampling: Sampling, rng: np.random.Generator) -> dict:
         uneven = rng.random() < sampling.uneven
@@ -76,102 +115,23 @@ class SceneSource:
         return finish_pair(*views, truth, sampling, rng)
 
 
-def pairs_source(path: str | Path, frames: Frames = None) -> SceneSource:
-    """The pairs of an HDF5 file or a CSV list (`data.pairs`), all of which need their truth.
-
-    `frames` goes by the attributes `source_frame` and `target_frame` of the groups of HDF5.
-    """
-    held = open_pairs(path)
-    where = str(Path(path).resolve())
-    files = [Path(path)]
-    recorded: list[tuple[Hashable, ...]]
-    numbers: list[tuple[int | str, int | str]]
-    if isinstance(held, Hdf5Pairs):
-        numbers = [held.frames(i) for i in range(len(held))]
-        recorded = [tuple((where, frame) for frame in pair) for pair in numbers]
-    else:
-        assert isinstance(held, CsvPairs)  # there is no third form
-        numbers = list(held.listed)
-        places = [[(held.path.parent / name).resolve() for name in pair] for pair in held.listed]
-        recorded = [tuple((str(place),) for place in pair) for pair in places]
-        files += sorted({place for pair in places for place in pair})
-    rows: Sequence[int] = range(len(held))
-    if frames is not None:
-        if any(not isinstance(number, int) for pair in numbers for number in pair):
-            raise ValueError(
-                f"frames: {path} does not say from which frames its pairs are; "
-                "make a list of pairs for training and another for validation"
-            )
-        rows = [i for i in rows if among(frames, numbers[i])]
-
-    def read(row: int) -> Pair:
-        pair = held[rows[row]]
-        if pair.transform is None:
-            raise ValueError(f"{path}: {pair.name} has no true transform to learn from")
-        return pair
-
-    return _source(path, [held.names[i] for i in rows], [recorded[i] for i in rows], read, files)
-
-
-def kitti_source(
+def scene_source(
     path: str | Path,
     *,
-    cache: Path,
-    sequences: tuple[str, ...] = ("00",),
-    distances: tuple[float, ...] = (10.0,),
-    stride: int = 1,
-    frames: Frames = None,
+    names: Sequence[str],
+    frames: Sequence[tuple[Hashable, ...]],
+    read: Callable[[int], Pair],
+    files: Sequence[Path],
+    single: bool = False,
 ) -> SceneSource:
-    """Frames of drives in KITTI's layout, `distances` meters apart, with refined truths.
+    """A source whose pairs `read` gives, with their truths; the last ones stay in memory.
 
-    A pair starts every `stride` frames. Refined truths are kept in the folder `cache`.
+    `names` and `frames` are those of `SceneSource`, one of each item; `files` are all that is read,
+    for the stamp. Raises ValueError where there is no item.
     """
-    items = []
-    for sequence in sequences:
-        for distance in distances:
-            found = kitti.read_pairs(
-                path, sequence, cache / f"truths_{sequence}_{distance:g}m.npz", distance, stride
-            )
-            for (a, b), transform in zip(found.frames.tolist(), found.transforms, strict=True):
-                if among(frames, (a, b)):
-                    items.append((sequence, a, b, transform))
-
-    def read(row: int) -> Pair:
-        sequence, a, b, transform = items[row]
-        clouds = [kitti.read_frame(path, sequence, frame) for frame in (a, b)]
-        return Pair(f"{sequence}/{a:06d}-{b:06d}", *clouds, transform=transform)
-
-    where = str(Path(path).resolve())
-    return _source(
-        path,
-        [f"{sequence}/{a:06d}-{b:06d}" for sequence, a, b, _ in items],
-        [((where, sequence, a), (where, sequence, b)) for sequence, a, b, _ in items],
-        read,
-        [file for sequence in sequences for file in scans_of(Path(path))[sequence]],
-    )
-
-
-def scans_source(path: str | Path) -> SceneSource:
-    """Both clouds are views of one scan: every file below a folder whose suffix `cfr_jax.io` reads,
-    but for hidden ones."""
-    folder = Path(path)
-    if not folder.is_dir():
-        raise ValueError(f"no folder of scans at {folder}")
-    files = loose_files(folder, CLOUD_SUFFIXES)
-
-    def read(row: int) -> Pair:
-        scan = io.read(files[row])
-        clouds = scan.points, scan.points, scan.normals, scan.normals
-        return Pair(files[row].name, *clouds, transform=np.eye(4))
-
-    names = [file.relative_to(folder).as_posix() for file in files]
-    recorded = [((str(file.resolve()),),) for file in files]
-    return _source(path, names, recorded, read, files, single=True)
-
-
-def _source(path, names, frames, read, files, single=False):
     if not names:
-        wanted = " ".join(CLOUD_SUFFIXES) if single else "pairs, and some within `frames`"
+        clouds = " ".join(by_suffix(form for form in formats.of_clouds() if form.loose))
+        wanted = clouds if single else "pairs, and some within `frames`"
         raise ValueError(f"{path}: no scan to train on there; wanted {wanted}")
     sizes = [file.stat().st_size if file.is_file() else -1 for file in files]
     stamp = hashlib.sha256(repr((list(names), sizes)).encode()).hexdigest()

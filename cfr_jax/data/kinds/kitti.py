@@ -1,0 +1,130 @@
+"""Drives in the layout of KITTI odometry (`data.kitti`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cfr_jax.data.kinds.kind import DataKind
+
+if TYPE_CHECKING:
+    from cfr_jax.data.pairs import Pair
+    from cfr_jax.data.scenes import SceneSource
+
+
+def recognize(path: Path) -> str | None:
+    """A folder `sequences/NN/velodyne` with scans."""
+    scans = {name: files for name, files in _sequences(path).items() if files}
+    if not scans:
+        return None
+    told = ", ".join(f"{name} ({len(files)} scans)" for name, files in scans.items())
+    return f"LiDAR sequences in the layout of KITTI odometry: {told}"
+
+
+def train(
+    path: str | Path,
+    cache: Path,
+    *,
+    sequences: tuple[str, ...] = ("00",),
+    distances: tuple[float, ...] = (10.0,),
+    stride: int = 1,
+    frames: tuple[int, int] | None = None,
+) -> SceneSource:
+    """Frames `distances` meters apart, with refined truths, which are kept in `cache`.
+
+    A pair starts every `stride` frames; both of its frames lie from the first of `frames` up to,
+    not including, the second (None: all).
+    """
+    from cfr_jax.data import kitti
+    from cfr_jax.data.pairs import Pair, among
+    from cfr_jax.data.scenes import scene_source
+
+    items = []
+    for sequence in sequences:
+        for distance in distances:
+            found = kitti.read_pairs(
+                path, sequence, cache / f"truths_{sequence}_{distance:g}m.npz", distance, stride
+            )
+            for (a, b), transform in zip(found.frames.tolist(), found.transforms, strict=True):
+                if among(frames, (a, b)):
+                    items.append((sequence, a, b, transform))
+
+    def read(row: int) -> Pair:
+        sequence, a, b, transform = items[row]
+        clouds = [kitti.read_frame(path, sequence, frame) for frame in (a, b)]
+        return Pair(f"{sequence}/{a:06d}-{b:06d}", *clouds, transform=transform)
+
+    where = str(Path(path).resolve())
+    return scene_source(
+        path,
+        names=[f"{sequence}/{a:06d}-{b:06d}" for sequence, a, b, _ in items],
+        frames=[((where, sequence, a), (where, sequence, b)) for sequence, a, b, _ in items],
+        read=read,
+        files=[file for sequence in sequences for file in _sequences(Path(path))[sequence]],
+    )
+
+
+def evaluate(
+    path: str | Path,
+    cache: Path,
+    *,
+    sequences: tuple[str, ...],
+    distance: float,
+    stride: int,
+    points: int,
+    angle: float,
+    translation: float,
+    frames: tuple[int, int] | tuple[()] | None = None,
+) -> Sequence[Pair]:
+    """Frames `distance` meters apart, thinned to `points` and moved at random (`kitti.scan_pair`).
+
+    With a `stride` of 0 the next pair starts after the last, as published.
+    """
+    from cfr_jax.data import kitti
+    from cfr_jax.data.pairs import PairsOnDemand, among
+
+    parts = [
+        kitti.read_pairs(
+            path,
+            sequence,
+            cache=cache / f"truths_{sequence}.npz",
+            distance=distance,
+            stride=stride or None,
+        )
+        for sequence in sequences
+    ]
+    places = [
+        (part, index)
+        for part in parts
+        for index, pair in enumerate(part.frames.tolist())
+        if among(frames or None, pair)
+    ]
+
+    def make(index: int) -> Pair:
+        part, row = places[index]
+        return kitti.scan_pair(part, row, points, angle, translation)
+
+    return PairsOnDemand(len(places), make)
+
+
+def list_scans(path: Path) -> list[Path]:
+    """The scans of all sequences, one sequence after the other."""
+    return [file for files in _sequences(path).values() for file in files]
+
+
+def _sequences(folder: Path) -> dict[str, list[Path]]:
+    """The scans of each sequence."""
+    places = sorted((folder / "sequences").glob("*/velodyne"))
+    return {place.parent.name: sorted(place.glob("*.bin")) for place in places}
+
+
+KIND = DataKind(
+    name="kitti",
+    words="a folder of KITTI odometry",
+    recognize=recognize,
+    train=train,
+    evaluate=evaluate,
+    example="eval_scans_lidar.py",
+    list_scans=list_scans,
+)

@@ -1,0 +1,42 @@
+"""The folder of the ModelNet40 benchmark (`data.modelnet`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from cfr_jax.data.kinds import corpus
+from cfr_jax.data.kinds.kind import DataKind
+
+if TYPE_CHECKING:
+    from cfr_jax.data.pairs import Pair
+
+
+def recognize(path: Path) -> str | None:
+    """HDF5 files, and the two lists of them."""
+    lists = ("train_files.txt", "test_files.txt")
+    if not path.is_dir() or not all((path / name).is_file() for name in lists):
+        return None
+    train, test = (len((path / name).read_text().split()) for name in lists)
+    return f"ModelNet40 in HDF5, {train} files of training shapes and {test} of test shapes"
+
+
+def evaluate(
+    path: str | Path, cache: Path, *, split: Literal["train", "val", "test"], protocol: str
+) -> Sequence[Pair]:
+    """A pair of each shape of a published split."""
+    from cfr_jax.data.modelnet import read_modelnet40
+    from cfr_jax.data.protocol import fixed_pairs
+
+    return fixed_pairs(read_modelnet40(path, split), protocol)
+
+
+KIND = DataKind(
+    name="modelnet40",
+    words="the folder of ModelNet40",
+    recognize=recognize,
+    evaluate=evaluate,
+    example="eval_modelnet40.py",
+    read_shapes=corpus.read_shapes,
+)

@@ -1,0 +1,88 @@
+"""A CSV list, a line a pair of files (`data.pairs`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cfr_jax.data.kinds.kind import DataKind, Listing
+
+if TYPE_CHECKING:
+    from cfr_jax.data.pairs import Pair
+    from cfr_jax.data.scenes import SceneSource
+
+_SUFFIXES = (".csv", ".tsv", ".txt")
+
+
+def recognize(path: Path) -> str | None:
+    """By the suffix; how many lines there are is told, not whether each is a pair."""
+    if not path.is_file() or path.suffix.lower() not in _SUFFIXES:
+        return None
+    try:
+        lines = path.read_text("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return None
+    rows = [line for line in lines if line.strip() and not line.startswith("#")]
+    return f"a list of {len(rows)} lines, a pair each"
+
+
+def train(path: str | Path, cache: Path, *, frames: tuple[int, int] | None = None) -> SceneSource:
+    """All pairs, each of which needs its truth; a list does not say from which frames they are."""
+    from cfr_jax.data.pairs import CsvPairs, with_truth
+    from cfr_jax.data.scenes import scene_source
+
+    held = CsvPairs(path)
+    _refuse(frames, path)
+    places = [[(held.path.parent / name).resolve() for name in pair] for pair in held.listed]
+    return scene_source(
+        path,
+        names=held.names,
+        frames=[tuple((str(place),) for place in pair) for pair in places],
+        read=lambda row: with_truth(held, row),
+        files=[held.path, *sorted({place for pair in places for place in pair})],
+    )
+
+
+def evaluate(
+    path: str | Path, cache: Path, *, frames: tuple[int, int] | tuple[()] | None = None
+) -> Sequence[Pair]:
+    """All pairs of the list."""
+    from cfr_jax.data.pairs import CsvPairs
+
+    held = CsvPairs(path)
+    _refuse(frames, path)
+    return held
+
+
+def list_pairs(path: Path) -> Listing:
+    """The files of each line, of which one at least has to be there."""
+    from cfr_jax.data.pairs import CsvPairs
+
+    held = CsvPairs(path)
+    places = [(path.parent / source, path.parent / target) for source, target in held.listed]
+    if not any(file.exists() for place in places for file in place):
+        raise ValueError(
+            f"{path}: of its {len(places)} pairs no file is there, as {places[0][0]}\n"
+            "wanted lines of `source,target`, paths relative to the folder of the list"
+        )
+    return Listing(held.listed, places, "pairs of a list")
+
+
+def _refuse(frames: object, path: str | Path) -> None:
+    if frames:
+        raise ValueError(
+            f"frames: {path} does not say from which frames its pairs are; "
+            "make a list of its own for each use"
+        )
+
+
+KIND = DataKind(
+    name="pair-list",
+    words="a CSV list of `source,target` lines",
+    recognize=recognize,
+    train=train,
+    evaluate=evaluate,
+    example="eval_scans_rgbd.py",
+    list_pairs=list_pairs,
+)
