@@ -13,6 +13,7 @@ from jax.sharding import Mesh
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.loader import Mixture
 from cfr_jax.data.making.build import ENOUGH
+from cfr_jax.networks.probability import uncalibrated
 from cfr_jax.training import devices, optimizers, sources
 from cfr_jax.training.config import Phase, TrainingConfig, checked
 from cfr_jax.training.learner import Learner, learner
@@ -113,7 +114,8 @@ def fresh_params(config: TrainingConfig, chosen: Learner) -> dict:
     key = jax.random.key(config.seed)
     if not config.train.start_from:
         return jax.jit(chosen.fresh)(key)
-    params = weights.load_params(config.train.start_from, config.network)
+    # the calibration is of the weights as they were
+    params = uncalibrated(weights.load_params(config.train.start_from, config.network))
     shapes = [jax.tree.map(jnp.shape, tree) for tree in (params, jax.eval_shape(chosen.fresh, key))]
     if shapes[0] != shapes[1]:
         raise ValueError(
