@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from cfr_jax.alignment import confidence
 from cfr_jax.alignment.answers import Alignment, answer
 from cfr_jax.alignment.case import Case
 from cfr_jax.alignment.planning import Plan, planned
@@ -17,6 +18,7 @@ from cfr_jax.alignment.refining import refine_every_point, refine_used_points
 from cfr_jax.alignment.search import search
 from cfr_jax.alignment.second_look import look_again
 from cfr_jax.alignment.solving import solve_case
+from cfr_jax.networks.probability import calibration_of
 from cfr_jax.refine import Refinement, find
 from cfr_jax.weights.files import load_params
 
@@ -52,8 +54,8 @@ def align(
     each other is taken; "global" tries a cover of all rotations (`search`), which takes some
     times as long, and tells of other motions that fit about as well. Without `initial`, a refined
     answer that is not to be trusted gets a `second_look`: some starts around the first are tried in
-    the same way, and what is more likely right is kept. The same call gives the same answer, to the
-    bit, on the same machine.
+    the same way, and what is more likely right is kept (weights without calibration cannot tell,
+    and take none). The same call gives the same answer, to the bit, on the same machine.
 
     Raises ValueError for clouds without extent or with fewer than 3 points, wrong shapes, values
     that are not finite, and an `initial` that is no rigid motion or leaves the clouds far apart;
@@ -103,12 +105,15 @@ def steps(
 
 
 def checked_params(params: Any) -> Mapping:
-    """The weights that ship for None; raises ValueError for what are no parameters."""
+    """The weights that ship for None; raises ValueError for what are no parameters, and for a
+    calibration made of other clues than `align` finds."""
     params = _default_params() if params is None else params
     if not isinstance(params, Mapping):
         raise ValueError(
             f"params: got a {type(params).__name__}, wanted the parameters of load_params"
         )
+    if (fitted := calibration_of(params)) is not None:
+        fitted.check("align", confidence.NAMES)
     return params
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from cfr_jax.alignment import confidence, doubts, quality, search, solving
 from cfr_jax.alignment.case import Case
+from cfr_jax.networks.probability import calibration_of
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,9 @@ class Alignment:
     refined: bool
     """Whether `transform` is not the network's last, but an answer that fits no worse: the
     refinement's, or the start where that fits better still."""
-    confidence: float
-    """Estimated probability, in [0, 1], that the motion is right to 5 degrees and 0.1 radii."""
+    confidence: float | None
+    """Estimated probability, in [0, 1], that the motion is right to 5 degrees and 0.1 radii. None
+    where the weights carry no calibration."""
     clues: dict[str, float]
     """What the confidence was estimated from (`confidence.Clues`)."""
     determined: bool
@@ -64,7 +66,9 @@ class Alignment:
 
     @property
     def trusted(self) -> bool:
-        """Whether the motion is determined and more likely right than wrong."""
+        """Whether the motion is determined and more likely right than wrong, and that is known."""
+        if self.confidence is None:
+            return False
         return self.determined and self.confidence >= doubts.TRUSTED
 
     def to_open3d(self) -> Any:
@@ -100,7 +104,7 @@ def answer(case: Case) -> Alignment:
     weakest = np.asarray(found.quality.weakest)[resistance.argmin()]
     fitness = float(found.quality.fitness)
     clues = confidence.named(found.clues)
-    probability = doubts.probability(clues, fitness)
+    probability = doubts.probability(calibration_of(case.params), clues, fitness)
     neighbors = min(plan.source.neighbors.shape[1], plan.target.neighbors.shape[1])
     return Alignment(
         transform=transform,

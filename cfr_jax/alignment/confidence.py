@@ -1,13 +1,14 @@
 """The probability that an alignment is right, from the network's clues and from the surfaces.
 
 Right means within 5 degrees and a tenth of the unit sphere's radius. The probability is a logistic
-regression on clues, fitted to validation pairs with the weights that ship
-(`benchmarks/fit_confidence.py`; docs/confidence.md shows how well it holds on others). It is nearer
-the truth the closer one's own data are to those, and means little for other weights.
+regression on clues, whose coefficients come with the weights (`networks.probability`): they are
+fitted to validation pairs (`cfr calibrate`; docs/confidence.md shows how well that holds on other
+pairs). It is nearer the truth the closer one's own data are to those.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 
 import jax.numpy as jnp
@@ -16,8 +17,8 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from cfr_jax.alignment.quality import Quality
-from cfr_jax.networks import calibration
-from cfr_jax.networks.clues import SURE, NetworkClues, logit, turned
+from cfr_jax.networks.clues import NetworkClues, turned
+from cfr_jax.networks.probability import SURE, Calibration, logit
 
 
 @struct.dataclass
@@ -32,6 +33,11 @@ class Clues:
     """How far refinement turned the network's answer: log of degrees + 0.1."""
     resistance: Float[Array, ""]
     """Square root of the weakest resistance to a nudge."""
+
+
+OF_NETWORK = tuple(field.name for field in dataclasses.fields(NetworkClues))
+OF_SURFACES = tuple(f.name for f in dataclasses.fields(Clues) if f.name != "network")
+NAMES = OF_NETWORK + OF_SURFACES
 
 
 def gather(
@@ -56,7 +62,10 @@ def named(clues: Clues) -> dict[str, float]:
     return {name: float(value) for name, value in given.items()}
 
 
-def of_alignment(clues: Mapping[str, float]) -> float:
-    """Probability in [0, 1] that an answer with these `Clues`, by name, is right."""
-    sure = logit(calibration.ALIGN, clues)
+def of_alignment(fitted: Calibration | None, clues: Mapping[str, float]) -> float | None:
+    """Probability in [0, 1] that an answer with these `Clues`, by name, is right; None without
+    calibration."""
+    if fitted is None:
+        return None
+    sure = logit(fitted.align, clues)
     return float(1 / (1 + np.exp(-np.clip(sure, -SURE, SURE))))

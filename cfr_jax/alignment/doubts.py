@@ -10,6 +10,7 @@ from jaxtyping import Float
 from cfr_jax.alignment import confidence
 from cfr_jax.alignment.planning import SETTINGS
 from cfr_jax.geometry import motions
+from cfr_jax.networks.probability import Calibration
 
 # Below this the fit hardly suffers when a cloud slides or turns. Of planes, spheres, cylinders,
 # cones and the like, sampled twice by 200 to 500 points with noise, 97% measured less along their
@@ -23,15 +24,16 @@ _SIZES_APART = 5.0  # more than partial views of one thing differ in radius
 def warnings_of(
     free: Float[np.ndarray, " 6"] | None,
     rivals: Sequence[str],
-    probability: float,
+    probability: float | None,
     fitness: float,
     neighbors: int,
     size_ratio: float,
     searched: bool,
 ) -> tuple[str, ...]:
     """`free` is the twist that nothing determines, if there is one; `rivals` are the turns by which
-    other answers differ (`turns`); `size_ratio` is the radius of the source over the target's;
-    `searched` tells whether more than one start was tried."""
+    other answers differ (`turns`); `probability` is None where the weights have no calibration;
+    `size_ratio` is the radius of the source over the target's; `searched` tells whether more than
+    one start was tried."""
     warnings = []
     if not 1 / _SIZES_APART < size_ratio < _SIZES_APART:
         larger, smaller, times = "source", "target", size_ratio
@@ -44,7 +46,12 @@ def warnings_of(
         warnings.append(f"the clouds do not determine the motion: they {_describe(free)} freely")
     if rivals:
         warnings.append(f"nearly symmetric: fits about as well {' or '.join(rivals)}")
-    if probability < TRUSTED:
+    if probability is None:
+        warnings.append(
+            "not to be trusted: how likely it is right is unknown, as these weights carry no "
+            "calibration (`cfr calibrate` fits one)"
+        )
+    elif probability < TRUSTED:
         hint = "" if searched else '; clouds turned far need initial="global" (--global)'
         warnings.append(
             f"not to be trusted: confidence {probability:.2f}, "
@@ -57,11 +64,13 @@ def warnings_of(
     return tuple(warnings)
 
 
-def probability(clues: Mapping[str, float], fitness: float) -> float:
+def probability(
+    fitted: Calibration | None, clues: Mapping[str, float], fitness: float
+) -> float | None:
     """That the answer is right: no greater than the fitness where the clouds hardly meet. Those it
-    was fitted to did, and it says nothing of others."""
-    fitted = confidence.of_alignment(clues)
-    return min(fitted, fitness) if fitness < _HARDLY else fitted
+    was fitted to did, and it says nothing of others. None without calibration."""
+    told = confidence.of_alignment(fitted, clues)
+    return told if told is None or fitness >= _HARDLY else min(told, fitness)
 
 
 def turns(

@@ -25,6 +25,7 @@ from cfr_jax.networks.cfr.iterations import Encoded
 from cfr_jax.networks.cfr.registration import Registration, encode, register
 from cfr_jax.networks.clues import NetworkClues
 from cfr_jax.networks.inputs import Cloud, Settings, prepare
+from cfr_jax.networks.probability import Calibration
 from cfr_jax.refine import Refinement, generalized_icp
 from cfr_jax.refine.generalized_icp import score
 from cfr_jax.refine.surfaces import Surface
@@ -56,6 +57,7 @@ programs.storable(
     confidence.Clues,
     NetworkClues,
 )
+programs.storable_static(Calibration, Calibration.write, Calibration.read)
 
 
 def solve(params: Mapping, source: Cloud, target: Encoded, *, refine: Refinement | None) -> Found:

@@ -14,6 +14,7 @@ from typing import NoReturn
 from cfr_jax import __version__
 from cfr_jax.cli import (
     batch,
+    calibrate,
     completion,
     convert,
     data,
@@ -34,6 +35,7 @@ _COMMANDS = (
     reproduce,
     export,
     convert,
+    calibrate,
     data,
     completion,
 )

@@ -49,9 +49,9 @@ def run(args: argparse.Namespace) -> int:
     from hashlib import sha256
 
     from cfr_jax import __version__
-    from cfr_jax.networks.cfr.iterations import iterations_of
+    from cfr_jax.networks import table
     from cfr_jax.weights.authors import convert
-    from cfr_jax.weights.files import NETWORKS, network_of, read_weights, save_params
+    from cfr_jax.weights.files import network_of, read_weights, save_params
 
     params = convert(args.checkpoint)
     notes = {
@@ -60,8 +60,8 @@ def run(args: argparse.Namespace) -> int:
         "converted_by": f"cfr_jax {__version__}",
     }
     save_params(args.out, params, notes)
-    kind = network_of(params)
-    trained = f", {iterations_of(params)} iterations" if kind == "cfr" else ""
-    print(f"wrote       {args.out}: {NETWORKS[kind]}{trained}")
+    record = table.network(network_of(params))
+    trained = f", {record.iterations(params)} iterations" if record.iterations else ""
+    print(f"wrote       {args.out}: {record.title}{trained}")
     print(f"sha256      {read_weights(args.out).sha256}")
     return 0

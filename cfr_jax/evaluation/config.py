@@ -21,7 +21,7 @@ Threshold = tuple[float, float]
 class MethodEntry:
     """A method of the table, and how it is run."""
 
-    use: str  # a name of `baselines.NAMES`, "truth", "cfr" or "rpmnet"
+    use: str  # a name of `baselines.NAMES`, "truth", or a network of `networks.table`
     options: dict[str, Any] = field(default_factory=dict)  # what it takes, by name
     weights: str = ""  # of a network, instead of the config's; by name or path
     threads: int | None = None  # cores of its process; None: the config's

@@ -9,17 +9,15 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.baselines import NAMES, baseline
 from cfr_jax.evaluation.config import EvaluationConfig
+from cfr_jax.evaluation.solvers.solver import Answer, Solver, clouds_of
 from cfr_jax.evaluation.store import code_digest
-from cfr_jax.io import PointCloud
-from cfr_jax.io.cloud import usable_normals
+from cfr_jax.networks import table
 
 OWN = "cfr"
-NETWORKS = (OWN, "rpmnet")
 TRUTH = "truth"
 # Whose seed changes the answer.
 _DRAWING = {"fgr", "fgr_icp", "ransac"}
@@ -34,22 +32,8 @@ _OURS = (
     "refine/*.py",
     "runtime/*.py",
     "weights/*.py",
-    "evaluation/modules.py",
-    "evaluation/network.py",
+    "evaluation/solvers/*.py",
 )
-
-
-@dataclasses.dataclass(frozen=True)
-class Answer:
-    """What a method says of one pair."""
-
-    transforms: Float[np.ndarray, "i 4 4"]
-    """One for each iteration it tells of; the last is the answer. Maps source onto target."""
-    seconds: float
-    """From clouds in host memory to motions in host memory, without compilation."""
-
-
-Solver = Callable[[Sequence[Pair]], list[Answer]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,8 +57,10 @@ class Method:
 def methods_of(config: EvaluationConfig, names: Sequence[str], seed: int) -> list[Method]:
     """The methods called `names` in `config.methods`, in the order given; all by name if none are.
 
-    Where weights of a network's own are not there, or RPM-Net's, the method is left out. Raises
-    ValueError for unknown methods, and for weights that are not sound.
+    A network has its entry's `weights`; without, CFR has the config's, and RPM-Net its
+    `rpmnet_weights`. Where weights of a network's own are not there, or RPM-Net's, the method is
+    left out. Raises ValueError for unknown methods, for a network without weights, and for weights
+    that are not sound.
     """
     known = sorted(config.methods)
     unknown = [name for name in names if name not in known]
@@ -96,14 +82,16 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
         "estimated_normals": estimated,
         "batch": batch,
         "threads": threads,
-        "code": code_digest(*(_OURS if use in (*NETWORKS, "gicp_jax") else _PEERS)),
+        "code": code_digest(*(_OURS if use in (*table.names(), "gicp_jax") else _PEERS)),
     }
     make: Callable[[], Solver]
     modules = None
-    if use in NETWORKS:
+    if use in table.names():
         from cfr_jax.weights.files import NoWeights, read_weights
 
-        own = entry.weights or (None if use == OWN else config.rpmnet_weights)
+        own = entry.weights or (None if use == OWN else getattr(config, f"{use}_weights", ""))
+        if own == "":
+            raise ValueError(f"methods.{name}: lacks the weights of {table.network(use).title}")
         source = own or config.weights
         try:
             weights = read_weights(source, use)
@@ -114,7 +102,7 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
         about |= {"weights": weights.name, "sha256": weights.sha256, "seed": seed}
         make = functools.partial(
             _make_own,
-            network=use,
+            network=table.network(use),
             weights=source,
             estimated=estimated,
             batch=batch,
@@ -123,7 +111,7 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
         )
         if entry.modules:
             modules = functools.partial(
-                _make_modules, use, source, options.get("settings"), estimated
+                _make_modules, table.network(use), source, options.get("settings"), estimated
             )
     elif use == TRUTH:
         make = _make_truth
@@ -132,21 +120,9 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
             options["seed"] = about["seed"] = seed
         make = functools.partial(make_baseline, use, options, estimated)
     else:
-        known = ", ".join((*NETWORKS, TRUTH))
+        known = ", ".join((*table.names(), TRUTH))
         raise ValueError(f"methods.{name}.use is {use!r}, wanted {known}, or one of {NAMES}")
     return Method(name, make, about, batch, threads, modules=modules)
-
-
-def clouds_of(pair: Pair, estimated: bool) -> tuple[PointCloud, PointCloud]:
-    """Source and target, without their normals where these are unusable or not wanted."""
-    return (
-        _cloud("source", pair.source, None if estimated else pair.source_normals),
-        _cloud("target", pair.target, None if estimated else pair.target_normals),
-    )
-
-
-def _cloud(name: str, points: np.ndarray, normals: np.ndarray | None) -> PointCloud:
-    return PointCloud(points, None if normals is None else usable_normals(normals), name)
 
 
 def make_baseline(use: str, options: dict[str, Any], estimated: bool) -> Solver:
@@ -171,12 +147,12 @@ def _make_truth() -> Solver:
 
 
 def _make_own(**options: Any) -> Solver:
-    from cfr_jax.evaluation.network import make_network
+    from cfr_jax.evaluation.solvers.network_solver import make_network
 
     return make_network(**options)
 
 
 def _make_modules(*arguments: Any) -> Callable[[Sequence[Pair]], list[dict[str, float]]]:
-    from cfr_jax.evaluation.modules import make_modules
+    from cfr_jax.evaluation.solvers.module_times import make_modules
 
     return make_modules(*arguments)

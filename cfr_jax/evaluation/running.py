@@ -13,7 +13,8 @@ from tqdm import tqdm
 
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation import machine, store
-from cfr_jax.evaluation.methods import Answer, Method
+from cfr_jax.evaluation.methods import Method
+from cfr_jax.evaluation.solvers.solver import Answer
 from cfr_jax.evaluation.store import Record, Records
 from cfr_jax.evaluation.worker import Failed, Missing, Worker
 from cfr_jax.geometry.motions import are_rigid

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cfr_jax.data.pairs import Pair
-    from cfr_jax.evaluation.methods import Answer, Method
+    from cfr_jax.evaluation.methods import Method
+    from cfr_jax.evaluation.solvers.solver import Answer
 
 START_UP = 600.0  # seconds that importing may take, and then compiling
 

@@ -1,13 +1,10 @@
 """What a network alone tells of its answer, and how probable that makes it.
 
 Right means within 5 degrees and a tenth of the unit sphere's radius. The probability is a logistic
-regression on the clues, fitted to validation pairs (`benchmarks/fit_confidence.py`).
+regression on the clues, whose coefficients come with the weights (`networks.probability`).
 """
 
 from __future__ import annotations
-
-from collections.abc import Mapping
-from typing import Any
 
 import jax.numpy as jnp
 from flax import struct
@@ -15,10 +12,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from cfr_jax.geometry import rigid
-from cfr_jax.networks import calibration
+from cfr_jax.networks.probability import SURE, Calibration, logit
 
 _HIGHEST = lax.Precision.HIGHEST
-SURE = 30.0  # larger logits are rounding
 
 
 @struct.dataclass
@@ -75,17 +71,12 @@ def of_network(
     )
 
 
-def of_registration(clues: NetworkClues) -> Float[Array, ""]:
-    """Probability in [0, 1] that the network's own answer is right."""
-    sure = logit(calibration.REGISTER, vars(clues))
+def of_registration(fitted: Calibration | None, clues: NetworkClues) -> Float[Array, ""] | None:
+    """Probability in [0, 1] that the network's own answer is right; None without calibration."""
+    if fitted is None:
+        return None
+    sure = logit(fitted.register, vars(clues))
     return 1 / (1 + jnp.exp(-jnp.clip(sure, -SURE, SURE)))
-
-
-def logit(fitted: Mapping[str, float], clues: Mapping[str, Any]) -> Any:
-    """The bias and the weighted sum of the clues, by name."""
-    return fitted["bias"] + sum(
-        weight * clues[name] for name, weight in fitted.items() if name != "bias"
-    )
 
 
 def _mean(values, mask):

@@ -8,11 +8,16 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import flax.linen as nn
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 EPSILON = 1e-5
+GROUPS = 8  # of the channels, in most layers of the published networks
+
+# What PyTorch's Linear starts from, as the published networks did.
+kernel_init = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 
 
 class Layer(NamedTuple):
@@ -94,3 +99,29 @@ def projections(
         for s in (shift, scale)
     )
     return flat, tilt
+
+
+def layer_of(module: nn.Module, name: str, inputs: int, width: int) -> Layer:
+    """The parameters of a Linear and its GroupNorm, as `name` in a module under construction."""
+    kernel, bias = _Linear(width, name=f"{name}_dense")(inputs)
+    scale = module.param(f"{name}_scale", nn.initializers.ones, (width,))
+    shift = module.param(f"{name}_shift", nn.initializers.zeros, (width,))
+    return Layer(kernel, bias, scale, shift)
+
+
+class _Linear(nn.Module):
+    """The parameters of a Dense, for those who apply them in their own way."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, inputs: int):
+        kernel = self.param("kernel", kernel_init, (inputs, self.width))
+        return kernel, self.param("bias", nn.initializers.zeros, (self.width,))
+
+
+def unit_rows(x: Float[Array, "n c"]) -> Float[Array, "n c"]:
+    """Rows scaled to length one; a row shorter than 1e-12 becomes zero, with zero gradient."""
+    square = jnp.sum(x * x, axis=-1, keepdims=True)
+    positive = square > 1e-24  # below, the cube in the derivative would overflow
+    return jnp.where(positive, x * lax.rsqrt(jnp.where(positive, square, 1)), 0)

@@ -8,7 +8,8 @@ Sinkhorn, and neighborhoods searched once (a rigid motion does not change them);
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -18,17 +19,52 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from cfr_jax.geometry import rigid
 from cfr_jax.geometry.neighbors import first_in_ball
-from cfr_jax.networks.cfr.iterations import Step
-from cfr_jax.networks.cfr.modules import GROUPS, AnnealingNet, kernel_init, layer_of, unit_rows
+from cfr_jax.networks.annealing import AUTHORS_LAYERS, AnnealingNet
 from cfr_jax.networks.extraction import pooled_features
 from cfr_jax.networks.features import raw_features
 from cfr_jax.networks.inputs import Cloud, moved_by
-from cfr_jax.networks.layers import apply_layer
+from cfr_jax.networks.layers import GROUPS, apply_layer, kernel_init, layer_of, unit_rows
+from cfr_jax.networks.parts import (
+    ANNEALING,
+    FEATURES,
+    MATCHING,
+    MOTION,
+    NEIGHBORS,
+    matching,
+    move,
+)
+from cfr_jax.networks.record import Checkpoint, Network, Part, Place, Step, places_of
 from cfr_jax.networks.sinkhorn import Affinity, match
 
 _WIDTHS = (96, 96, 192)
 _CHANNELS = 96
 _RAW_CHANNELS = 10
+_LAYERS = (
+    *AUTHORS_LAYERS,
+    (
+        "feat_extractor.prepool.0",
+        "features/neighbor_0_dense/kernel",
+        "features/neighbor_0_dense/bias",
+    ),
+    ("feat_extractor.prepool.1", "features/neighbor_0_scale", "features/neighbor_0_shift"),
+    (
+        "feat_extractor.prepool.3",
+        "features/neighbor_1_dense/kernel",
+        "features/neighbor_1_dense/bias",
+    ),
+    ("feat_extractor.prepool.4", "features/neighbor_1_scale", "features/neighbor_1_shift"),
+    (
+        "feat_extractor.prepool.6",
+        "features/neighbor_2_dense/kernel",
+        "features/neighbor_2_dense/bias",
+    ),
+    ("feat_extractor.prepool.7", "features/neighbor_2_scale", "features/neighbor_2_shift"),
+    ("feat_extractor.postpool.0", "features/point_0_dense/kernel", "features/point_0_dense/bias"),
+    ("feat_extractor.postpool.1", "features/point_0_scale", "features/point_0_shift"),
+    ("feat_extractor.postpool.3", "features/point_1_dense/kernel", "features/point_1_dense/bias"),
+    ("feat_extractor.postpool.4", "features/point_1_scale", "features/point_1_shift"),
+    ("feat_extractor.postpool.6", "features/out/kernel", "features/out/bias"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,8 +108,8 @@ class RPMNet(nn.Module):
         return self.features(raw), self.annealing(source, target)
 
 
-def init_params(key: jax.Array) -> dict:
-    """Fresh parameters, a pytree of float32 arrays."""
+def init_params(key: jax.Array, iterations: int | None = None) -> dict:
+    """Fresh parameters, a pytree of float32 arrays; any number of `iterations` shares them."""
     points, raw = jnp.zeros((2, 3)), jnp.zeros((2, 1, _RAW_CHANNELS))
     return RPMNet().init(key, raw, points, points)["params"]
 
@@ -124,3 +160,68 @@ def extract(network: RPMNet, cloud: Cloud, neighbors: Int32[Array, "n k"]) -> Fl
     """The features of a cloud where it is now; unit rows."""
     raw = raw_features(cloud.points, cloud.normals, neighbors, ppf="angle", position=True)
     return network.features(raw, cloud.mask)
+
+
+def parts(params: dict, settings: RPMNetSettings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
+    """All parts of the registration of two clouds, for timing."""
+    network, count = bind(params), settings.iterations
+    search = jax.jit(lambda cloud: find_neighbors(cloud, settings))
+    extracted = jax.jit(lambda cloud, ball: extract(network, cloud, ball))
+    anneal = jax.jit(lambda *clouds: network.annealing(*clouds))
+    matched = matching("auto" if settings.optimized else "log space")
+
+    def of(source: Cloud, target: Cloud) -> Iterator[Part]:
+        features = []
+        for cloud in (source, target):
+            yield Part(NEIGHBORS, search, (cloud,), 1 if settings.optimized else count)
+            ball = search(cloud)
+            yield Part(FEATURES, extracted, (cloud, ball), count)
+            features.append(extracted(cloud, ball))
+        pair = source.points, target.points
+        yield Part(ANNEALING, anneal, pair, count)
+        beta, alpha = anneal(*pair)
+        given = (*features, beta[0], alpha[0], target.points, settings.passes)
+        yield Part(MATCHING, matched, given, count)
+        yield Part(MOTION, move, (source.points, matched(*given)), count)
+
+    return of
+
+
+def _trained(neighbors: int, iterations: int) -> RPMNetSettings:
+    return RPMNetSettings(neighbors=neighbors, iterations=iterations)
+
+
+def _recognizes(tensors: Collection[str]) -> bool:
+    return any(name.startswith("features/neighbor_") for name in tensors)
+
+
+def _arguments(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+    return {}
+
+
+def _theirs(tensors: Collection[str]) -> bool:
+    return any(name.startswith("feat_extractor.") for name in tensors)
+
+
+def _arguments_of_theirs(tensors: Collection[str]) -> dict[str, Any]:
+    return {}
+
+
+def _places(tensors: Collection[str]) -> dict[str, Place]:
+    return places_of(_LAYERS)
+
+
+NETWORK = Network(
+    name="rpmnet",
+    title="RPM-Net",
+    settings=RPMNetSettings,
+    fresh=init_params,
+    unroll=unroll,
+    recognizes=_recognizes,
+    arguments=_arguments,
+    trained=_trained,
+    validated=RPMNetSettings(),
+    own_neighbors=True,
+    parts=parts,
+    checkpoint=Checkpoint(_theirs, _arguments_of_theirs, _places),
+)

@@ -47,6 +47,17 @@ def storable(*nodes: type) -> None:
         )
 
 
+def storable_static(node: type, write: Callable[[Any], str], read: Callable[[str], Any]) -> None:
+    """The same for a class that is static (`jax.tree_util.register_static`), by what makes a text
+    of one and one of a text."""
+    jax_export.register_pytree_node_serialization(
+        node,
+        serialized_name=f"{node.__module__}.{node.__qualname__}",
+        serialize_auxdata=lambda one: write(one).encode(),
+        deserialize_auxdata=lambda text: read(text.decode()),
+    )
+
+
 def compiled(function: Callable, *arguments: Any, **static: Any) -> Callable:
     """The compiled program of a jitted function for arguments of these sizes, made once, so that
     compiling can be timed apart from running."""

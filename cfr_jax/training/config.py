@@ -129,7 +129,7 @@ class TrainingConfig:
     """All that `train.py` reads. A section may be given as a dict of its fields."""
 
     seed: int = 0
-    network: str = "cfr"  # or "rpmnet"
+    network: str = "cfr"  # a name of `networks.table`
     iterations: int = 5
     shared: bool = False  # one light layer for all iterations, instead of one each
     settings: dict[str, Any] = field(default_factory=dict)

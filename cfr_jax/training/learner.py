@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 
-from cfr_jax.networks import inputs, rpmnet
-from cfr_jax.networks.cfr import iterations
-from cfr_jax.networks.cfr import modules as network
+from cfr_jax.networks import table
+from cfr_jax.networks.record import Network, Unroll
 from cfr_jax.training.config import Phase, TrainingConfig
-from cfr_jax.training.step import Unroll
-
-AnySettings = inputs.Settings | rpmnet.RPMNetSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,52 +20,43 @@ class Learner:
 
     fresh: Callable[[jax.Array], dict]
     unroll: Unroll
-    trained: Callable[[int], AnySettings]
+    trained: Callable[[int], Any]
     """Settings by the number of neighbors."""
-    validated: AnySettings
+    validated: Any
 
 
 def learner(config: TrainingConfig) -> Learner:
-    """The network that `config.network` names: "cfr", or "rpmnet" to compare with.
+    """The network of the table that `config.network` names.
 
     Raises ValueError for another, and for `config.settings` that it does not have.
     """
-    if config.network == "cfr":
-        changed = config.settings
-        _check_settings(changed)
-        of_training = {"detach_motion": True, **changed}
-        if config.train.precision == "bfloat16":
-            of_training["activations"] = "bfloat16"
-        return Learner(
-            fresh=lambda key: network.init_params(key, config.iterations, config.shared),
-            unroll=iterations.unroll,
-            trained=lambda count: inputs.Settings(neighbors=count, **of_training),
-            validated=inputs.Settings(**changed),
-        )
-    if config.network == "rpmnet":
-        if changed := config.settings:
-            raise ValueError(f"settings: got {', '.join(changed)}, wanted none for rpmnet")
-        if config.train.precision == "bfloat16":
-            raise ValueError("precision: got 'bfloat16', which rpmnet does not have")
-        return Learner(
-            fresh=rpmnet.init_params,
-            unroll=rpmnet.unroll,
-            trained=lambda count: rpmnet.RPMNetSettings(
-                neighbors=count, iterations=config.iterations
-            ),
-            validated=rpmnet.RPMNetSettings(),
-        )
-    raise ValueError(f"network: got {config.network!r}, wanted 'cfr' or 'rpmnet'")
+    record, changed = table.network(config.network), config.settings
+    _check_settings(record, changed)
+    of_training = dict(changed)
+    if config.train.precision == "bfloat16":
+        if "activations" not in _fields(record):
+            raise ValueError(f"precision: got 'bfloat16', which {record.name} does not have")
+        of_training["activations"] = "bfloat16"
+    variant = {name: getattr(config, name) for name in record.variants}
+    return Learner(
+        fresh=functools.partial(record.fresh, iterations=config.iterations, **variant),
+        unroll=record.unroll,
+        trained=lambda count: dataclasses.replace(
+            record.trained(count, config.iterations), **of_training
+        ),
+        validated=dataclasses.replace(record.validated, **changed),
+    )
 
 
-def _check_settings(changed: dict[str, Any]) -> None:
-    allowed = {field.name for field in dataclasses.fields(inputs.Settings)}
-    # those of the phases, of all training, and of its precision
-    allowed -= {"neighbors", "detach_motion", "activations"}
-    if unknown := changed.keys() - allowed:
+def _fields(record: Network) -> set[str]:
+    return {field.name for field in dataclasses.fields(record.settings)}
+
+
+def _check_settings(record: Network, changed: dict[str, Any]) -> None:
+    if unknown := changed.keys() - set(record.changeable):
+        wanted = f"some of {', '.join(sorted(record.changeable))}" if record.changeable else "none"
         raise ValueError(
-            f"settings: got {', '.join(sorted(unknown))}, wanted some of "
-            f"{', '.join(sorted(allowed))}"
+            f"settings: got {', '.join(sorted(unknown))}, wanted {wanted} for {record.name}"
         )
 
 

@@ -10,8 +10,8 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from cfr_jax.geometry import rigid
-from cfr_jax.networks.cfr.iterations import Step
 from cfr_jax.networks.inputs import Cloud
+from cfr_jax.networks.record import Step
 
 _DISCOUNT = 0.5  # the last iteration counts fully, each one before it half of the next
 _INLIER_WEIGHT = 0.01

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Hashable
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +17,10 @@ from jaxtyping import Array, Int, Int32, UInt32
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.device_pairs import Shapes, draw_pairs
 from cfr_jax.geometry.normals import estimate_normals
-from cfr_jax.networks.cfr.iterations import Step
 from cfr_jax.networks.inputs import Cloud
+from cfr_jax.networks.record import Unroll
 from cfr_jax.training.devices import AXIS
 from cfr_jax.training.losses import PairLoss, pair_loss
-
-Unroll = Callable[[dict, Cloud, Cloud, Hashable], Iterator[Step]]
-"""The iterations of a network on a pair: `iterations.unroll`, or `rpmnet.unroll`."""
 
 PRECISIONS = ("float32", "tensorfloat32", "bfloat16")
 # What the products of the learned layers run at: those whose precision is not stated in the

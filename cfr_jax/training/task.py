@@ -19,6 +19,7 @@ from cfr_jax.data.mixture import (
     fixed_pairs,
     open_mixture,
 )
+from cfr_jax.networks.probability import uncalibrated
 from cfr_jax.training import devices, optimizers
 from cfr_jax.training.config import Phase, TrainingConfig, checked
 from cfr_jax.training.learner import Learner, learner
@@ -119,7 +120,8 @@ def fresh_params(config: TrainingConfig, chosen: Learner) -> dict:
     key = jax.random.key(config.seed)
     if not config.train.start_from:
         return jax.jit(chosen.fresh)(key)
-    params = weights.load_params(config.train.start_from, config.network)
+    # the calibration is of the weights as they were
+    params = uncalibrated(weights.load_params(config.train.start_from, config.network))
     shapes = [jax.tree.map(jnp.shape, tree) for tree in (params, jax.eval_shape(chosen.fresh, key))]
     if shapes[0] != shapes[1]:
         raise ValueError(

@@ -1,4 +1,6 @@
-"""The published PyTorch checkpoints of CFR and RPM-Net as parameters of this package.
+"""The published PyTorch checkpoints of networks, as parameters of this package.
+
+Which tensor goes where stands in the record of each network (`networks.record.Checkpoint`).
 
 A checkpoint's layers are named by their place in PyTorch's modules. A 1x1 convolution is a Linear
 whose weight (out, in) carries one or two more axes of length 1; our kernels are (in, out).
@@ -7,7 +9,6 @@ whose weight (out, in) carries one or two more axes of length 1; our kernels are
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -17,80 +18,14 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors.numpy import load_file
 
-from cfr_jax.networks import rpmnet
-from cfr_jax.networks.cfr import modules as network
-from cfr_jax.weights.files import NETWORKS
-
-Layers = tuple[tuple[str, str, str], ...]
-
-_ANNEALING: Layers = (
-    # theirs; what their weight is called here; their bias
-    ("weights_net.prepool.0", "annealing/point_0_dense/kernel", "annealing/point_0_dense/bias"),
-    ("weights_net.prepool.1", "annealing/point_0_scale", "annealing/point_0_shift"),
-    ("weights_net.prepool.3", "annealing/point_1_dense/kernel", "annealing/point_1_dense/bias"),
-    ("weights_net.prepool.4", "annealing/point_1_scale", "annealing/point_1_shift"),
-    ("weights_net.prepool.6", "annealing/point_2_dense/kernel", "annealing/point_2_dense/bias"),
-    ("weights_net.prepool.7", "annealing/point_2_scale", "annealing/point_2_shift"),
-    ("weights_net.prepool.9", "annealing/point_3_dense/kernel", "annealing/point_3_dense/bias"),
-    ("weights_net.prepool.10", "annealing/point_3_scale", "annealing/point_3_shift"),
-    ("weights_net.prepool.12", "annealing/point_4_dense/kernel", "annealing/point_4_dense/bias"),
-    ("weights_net.prepool.13", "annealing/point_4_scale", "annealing/point_4_shift"),
-    ("weights_net.postpool.0", "annealing/pair_0_dense/kernel", "annealing/pair_0_dense/bias"),
-    ("weights_net.postpool.1", "annealing/pair_0_scale", "annealing/pair_0_shift"),
-    ("weights_net.postpool.3", "annealing/pair_1_dense/kernel", "annealing/pair_1_dense/bias"),
-    ("weights_net.postpool.4", "annealing/pair_1_scale", "annealing/pair_1_shift"),
-    ("weights_net.postpool.6", "annealing/out/kernel", "annealing/out/bias"),
-)
-_CFR: Layers = (
-    *_ANNEALING,
-    ("feat_extractor_ball.prepool.0", "features/kernel_0", "features/bias_0"),
-    ("feat_extractor_ball.prepool.1", "features/scale_0", "features/shift_0"),
-    ("feat_extractor_ball.prepool.3", "features/kernel_1", "features/bias_1"),
-    ("feat_extractor_ball.prepool.4", "features/scale_1", "features/shift_1"),
-    ("feat_extractor_ball.prepool.6", "features/kernel_2", "features/bias_2"),
-    ("feat_extractor_ball.prepool.7", "features/scale_2", "features/shift_2"),
-)
-_RPMNET: Layers = (
-    *_ANNEALING,
-    (
-        "feat_extractor.prepool.0",
-        "features/neighbor_0_dense/kernel",
-        "features/neighbor_0_dense/bias",
-    ),
-    ("feat_extractor.prepool.1", "features/neighbor_0_scale", "features/neighbor_0_shift"),
-    (
-        "feat_extractor.prepool.3",
-        "features/neighbor_1_dense/kernel",
-        "features/neighbor_1_dense/bias",
-    ),
-    ("feat_extractor.prepool.4", "features/neighbor_1_scale", "features/neighbor_1_shift"),
-    (
-        "feat_extractor.prepool.6",
-        "features/neighbor_2_dense/kernel",
-        "features/neighbor_2_dense/bias",
-    ),
-    ("feat_extractor.prepool.7", "features/neighbor_2_scale", "features/neighbor_2_shift"),
-    ("feat_extractor.postpool.0", "features/point_0_dense/kernel", "features/point_0_dense/bias"),
-    ("feat_extractor.postpool.1", "features/point_0_scale", "features/point_0_shift"),
-    ("feat_extractor.postpool.3", "features/point_1_dense/kernel", "features/point_1_dense/bias"),
-    ("feat_extractor.postpool.4", "features/point_1_scale", "features/point_1_shift"),
-    ("feat_extractor.postpool.6", "features/out/kernel", "features/out/bias"),
-)
-_LAYERS_PER_ITERATION = (
-    # one of each for every iteration {}, stacked here on a leading axis
-    ("feat_extractor_xyz.nets_a.{}.0", "cascade/scale", "cascade/shift"),
-    ("feat_extractor_xyz.nets_a.{}.2", "cascade/kernel", "cascade/bias"),
-    ("feat_extractor_xyz.nets_b.{}.0", "cascade/position", None),
-)
-_ITERATION = re.compile(r"feat_extractor_xyz\.nets_a\.(\d+)\.")
-_OF_CFR = ("feat_extractor_ball.", "feat_extractor_xyz.")
-_OF_RPMNET = "feat_extractor."
+from cfr_jax.networks import table
+from cfr_jax.networks.record import Checkpoint, Network
 
 
 def convert(path: str | Path) -> dict:
-    """Parameters from a checkpoint of the CFR or the RPM-Net authors' program.
+    """Parameters from a checkpoint of a network's authors: CFR or RPM-Net.
 
-    Which of the two is told by its names; `weights.network_of` says which it was. `path` is a
+    Its names tell which of the two it is; `weights.files.network_of` says which it was. `path` is a
     PyTorch file (.pth or .pt, needs torch; tensors alone are read, no object is ever unpickled), or
     a .safetensors or .npz file of the same tensors under the same names. Of CFR as many iterations
     as it holds are kept. Raises ValueError naming every tensor that is missing, unknown, of a wrong
@@ -116,21 +51,18 @@ def convert(path: str | Path) -> dict:
 
 def from_state_dict(state: dict[str, np.ndarray], name: str = "state_dict") -> dict:
     """`convert` for tensors that are already in memory, as arrays; `name` stands in errors."""
-    kind = _kind_of(state)
-    iterations = max(1, len({found[1] for found in map(_ITERATION.match, state) if found}))
-    fresh, homes = rpmnet.init_params, _homes(_RPMNET, 0)
-    if kind == "cfr":
-        fresh = functools.partial(network.init_params, iterations=iterations)
-        homes = _homes(_CFR, iterations)
+    record, checkpoint = _recognized(state, name)
+    places = checkpoint.places(state)
+    fresh = functools.partial(record.fresh, **checkpoint.arguments(state))
     ours = jax.eval_shape(fresh, jax.random.key(0))
     shapes = {key: leaf.shape for key, leaf in flatten_dict(ours, sep="/").items()}
-    faults = [f"{theirs} is missing" for theirs in homes if theirs not in state]
-    faults += [f"{theirs} is unknown" for theirs in state if theirs not in homes]
+    faults = [f"{theirs} is missing" for theirs in places if theirs not in state]
+    faults += [f"{theirs} is unknown" for theirs in state if theirs not in places]
     found: dict[str, list[np.ndarray]] = {}
-    for theirs, (home, stacked) in homes.items():
+    for theirs, place in places.items():
         if theirs not in state:
             continue
-        value, shape = state[theirs], shapes[home][1:] if stacked else shapes[home]
+        value, shape = state[theirs], shapes[place.path][1 if place.stacked else 0 :]
         if _squeezed(value.shape, len(shape)) != shape[::-1]:
             faults.append(f"{theirs} has shape {value.shape}, wanted {shape[::-1]}")
             continue
@@ -141,36 +73,24 @@ def from_state_dict(state: dict[str, np.ndarray], name: str = "state_dict") -> d
             value = value.reshape(shape[::-1]).T.astype(np.float32)
         if not np.isfinite(value).all():
             faults.append(f"{theirs} is not finite in float32")
-        found.setdefault(home, []).append(value)
+        found.setdefault(place.path, []).append(value)
     if faults:
-        raise ValueError(f"{name} does not hold {NETWORKS[kind]}: {'; '.join(faults)}")
-    joined = {
-        home: np.stack(v) if home.startswith("cascade/") else v[0] for home, v in found.items()
-    }
-    return unflatten_dict({home: jnp.asarray(value) for home, value in joined.items()}, sep="/")
+        raise ValueError(f"{name} does not hold {record.title}: {'; '.join(faults)}")
+    stacked = {place.path for place in places.values() if place.stacked}
+    joined = {path: np.stack(v) if path in stacked else v[0] for path, v in found.items()}
+    return unflatten_dict({path: jnp.asarray(value) for path, value in joined.items()}, sep="/")
 
 
-def _kind_of(names: Iterable[str]) -> str:
-    """The network that has tensors of these names; CFR where none of them tells."""
-    of_cfr = any(name.startswith(_OF_CFR) for name in names)
-    of_rpmnet = any(name.startswith(_OF_RPMNET) for name in names)
-    return "rpmnet" if of_rpmnet and not of_cfr else "cfr"
-
-
-def _homes(layers: Layers, iterations: int) -> dict[str, tuple[str, bool]]:
-    """Where each of their tensors goes, in the order of stacking, and whether it is stacked."""
-    rows = [(theirs, weight, bias, False) for theirs, weight, bias in layers]
-    rows += [
-        (theirs.format(i), weight, bias, True)
-        for i in range(iterations)
-        for theirs, weight, bias in _LAYERS_PER_ITERATION
-    ]
-    homes = {}
-    for theirs, weight, bias, stacked in rows:
-        homes[f"{theirs}.weight"] = (weight, stacked)
-        if bias is not None:
-            homes[f"{theirs}.bias"] = (bias, stacked)
-    return homes
+def _recognized(names: Iterable[str], where: str) -> tuple[Network, Checkpoint]:
+    """The network whose authors published tensors of these names."""
+    titles = []
+    for record in map(table.network, table.names()):
+        if record.checkpoint is None:
+            continue
+        if record.checkpoint.recognizes(names):
+            return record, record.checkpoint
+        titles.append(record.title)
+    raise ValueError(f"{where} does not hold {' or '.join(titles)}: no tensor has a name of theirs")
 
 
 def _squeezed(shape: tuple[int, ...], axes: int) -> tuple[int, ...]:

@@ -40,7 +40,7 @@ def read_card(name: str) -> dict[str, Any]:
         raise ValueError(
             f"the card of {name!r} is of other weights ({sha256[:12]}) than those that "
             f"are there ({file['sha256'][:12]})\n"
-            f"`python benchmarks/model_card.py {name}` measures and writes it anew"
+            f"`python tools/model_card.py {name}` measures and writes it anew"
         )
     return {**card, **file}
 

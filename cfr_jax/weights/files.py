@@ -6,7 +6,9 @@ import dataclasses
 import functools
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -14,13 +16,14 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from cfr_jax.networks import rpmnet
-from cfr_jax.networks.cfr import modules as cfr_network
+from cfr_jax.networks import table
+from cfr_jax.networks.clues import NetworkClues
+from cfr_jax.networks.probability import KEY, Calibration, calibration_of, uncalibrated
+from cfr_jax.networks.record import Network
 from cfr_jax.runtime.atomic import write_atomically
 
 SHIPPED = Path(__file__).parent / "shipped"
 DEFAULT = "object"
-NETWORKS = {"cfr": "CFR", "rpmnet": "RPM-Net"}
 
 
 class NoWeights(ValueError):
@@ -32,21 +35,28 @@ class Weights:
     """Parameters and where they come from."""
 
     params: dict
+    """With their calibration, where the file has one (`networks.probability`)."""
     name: str
     network: str
-    """One of `NETWORKS`; read off the names of the tensors."""
+    """Its name in the table of networks; read off the names of the tensors."""
     sha256: str
     """Over the tensors and the notes, as written into the file when it was made."""
     notes: dict[str, str]
+    """Whatever else the file says of them."""
 
 
 def save_params(path: str | Path, params: dict, notes: dict[str, str] | None = None) -> None:
     """Writes parameters and notes about them (strings), beside first and then renamed.
 
-    Raises OSError, naming the file, where it cannot be written.
+    The calibration of the parameters, if they have one, becomes a note, too. Raises OSError, naming
+    the file, where it cannot be written, and ValueError for notes under a name that is taken.
     """
     path, notes = Path(path), dict(notes or {})
-    tensors = {name: np.asarray(leaf) for name, leaf in flatten_dict(params, sep="/").items()}
+    for name in notes.keys() & {KEY, "sha256"}:
+        raise ValueError(f"notes: got {name!r}, which is written by itself; wanted other names")
+    if (calibration := calibration_of(params)) is not None:
+        notes[KEY] = calibration.write()
+    tensors = {name: np.asarray(leaf) for name, leaf in _flat(params).items()}
     try:
         # as bytes: a file that safetensors writes is closed to everyone but its owner
         write_atomically(path, save(tensors, metadata=notes | {"sha256": _digest(tensors, notes)}))
@@ -57,7 +67,10 @@ def save_params(path: str | Path, params: dict, notes: dict[str, str] | None = N
 def load_params(source: str | Path = DEFAULT, network: str = "cfr") -> dict:
     """Parameters that ship with the package, by name, or of a .safetensors file, by path.
 
-    A pytree of float32 arrays for `register`, or for `rpmnet.unroll` with `network="rpmnet"`.
+    A pytree of float32 arrays for `register`, or for the `unroll` of another `network` of the
+    table. `params["calibration"]` is what the confidence is computed with; weights that nobody
+    calibrated (`cfr calibrate`) lack it, and give no confidence. It has no leaves: gradients and
+    optimizers pass it by.
     Raises ValueError as `read_weights` does.
     """
     return read_weights(source, network).params
@@ -69,15 +82,16 @@ def shipped() -> tuple[str, ...]:
 
 
 def network_of(params: dict) -> str:
-    """Which of `NETWORKS` these parameters are made for, by their names."""
-    return _network_of(flatten_dict(params, sep="/"))
+    """The name of the network that parameters are made for, told by theirs."""
+    return table.recognize(_flat(params)).name
 
 
 def read_weights(source: str | Path = DEFAULT, network: str | None = None) -> Weights:
     """Weights with their network, name, digest and notes.
 
     Raises `NoWeights` where there is no such name or file, and ValueError where the file is not
-    sound (its digest does not fit) or holds another network than `network` (None: takes either).
+    sound (its digest does not fit, its calibration is damaged) or holds another network than
+    `network` (None: takes any).
     """
     path = Path(source)
     if str(source) in shipped():
@@ -101,39 +115,45 @@ def read_weights(source: str | Path = DEFAULT, network: str | None = None) -> We
         )
     if told != _digest(tensors, notes):
         raise ValueError(f"weights: {path} is damaged: its digest does not fit its content")
-    kind = _network_of(tensors)
+    try:
+        record = table.recognize(tensors)
+        calibration = _calibration(notes.pop(KEY, None))
+    except ValueError as error:
+        raise ValueError(f"weights: {path}: {error}") from error
     if path.parent != SHIPPED:  # those are checked by the tests: tracing a network takes a second
-        _check_shapes(path, tensors, kind)
-    if network not in (None, kind):
-        raise ValueError(
-            f"weights: {path} holds the network {NETWORKS[kind]}, wanted {NETWORKS[network]}"
-        )
+        _check_shapes(path, tensors, record)
+    if network not in (None, record.name):
+        wanted = table.network(network).title
+        raise ValueError(f"weights: {path} holds the network {record.title}, wanted {wanted}")
     # not jnp.asarray, which compiles a copy of each shape
     params = jax.device_put(unflatten_dict(tensors, sep="/"))
-    return Weights(params, path.stem, kind, told, notes)
+    if calibration is not None:
+        params[KEY] = calibration
+    return Weights(params, path.stem, record.name, told, notes)
 
 
-def _network_of(tensors):
-    return "rpmnet" if any(n.startswith("features/neighbor_") for n in tensors) else "cfr"
+def _calibration(note: str | None) -> Calibration | None:
+    if note is None:
+        return None
+    calibration = Calibration.read(note)
+    # those of `align` are checked where they are known
+    calibration.check("register", [field.name for field in dataclasses.fields(NetworkClues)])
+    return calibration
 
 
-def _check_shapes(path, tensors, kind):
-    fresh = rpmnet.init_params
-    if kind == "cfr":
-        stacked = tensors.get("cascade/kernel", np.zeros(0))
-        annealing = tensors.get("annealing/out/bias", np.zeros(10))
-        fresh = functools.partial(
-            cfr_network.init_params,
-            iterations=max(1, annealing.size // 2),
-            shared=stacked.shape[:1] == (1,),
-        )
-    wanted = jax.eval_shape(lambda: fresh(jax.random.key(0)))
-    wanted = {name: leaf.shape for name, leaf in flatten_dict(wanted, sep="/").items()}
+def _flat(params: Mapping[str, Any]) -> dict[str, Any]:
+    return flatten_dict(uncalibrated(params), sep="/")
+
+
+def _check_shapes(path: Path, tensors: dict[str, np.ndarray], record: Network) -> None:
     found = {name: leaf.shape for name, leaf in tensors.items()}
+    fresh = functools.partial(record.fresh, **record.arguments(found))
+    wanted = jax.eval_shape(fresh, jax.random.key(0))
+    wanted = {name: leaf.shape for name, leaf in flatten_dict(wanted, sep="/").items()}
     for name in sorted(wanted.keys() | found.keys()):
         if wanted.get(name) != found.get(name):
             raise ValueError(
-                f"weights: {path} does not hold {NETWORKS[kind]}: {name} is "
+                f"weights: {path} does not hold {record.title}: {name} is "
                 f"{found.get(name, 'missing')}, wanted {wanted.get(name, 'no such tensor')}"
             )
         if tensors[name].dtype != np.float32:

@@ -6,7 +6,8 @@ import solids
 
 from cfr_jax.alignment import doubts
 from cfr_jax.alignment.align import align
-from cfr_jax.networks import calibration
+from cfr_jax.networks.probability import calibration_of
+from cfr_jax.weights.files import load_params
 
 TRUTH = solids.motion(25)
 
@@ -90,14 +91,16 @@ def test_small_clouds_have_fewer_neighbors_and_it_says_so(count):
 
 
 def test_where_clouds_hardly_meet_the_fitness_bounds_the_confidence():
-    sure, unsure = ({name: 0.0 for name in calibration.ALIGN} for _ in range(2))
+    fitted = calibration_of(load_params())
+    weights = dict(fitted.align)
+    sure, unsure = (dict.fromkeys(weights, 0.0) for _ in range(2))
     sure["settled"], unsure["settled"] = (
-        (logit - calibration.ALIGN["bias"]) / calibration.ALIGN["settled"] for logit in (4.6, -2.9)
+        (logit - weights["bias"]) / weights["settled"] for logit in (4.6, -2.9)
     )
 
-    assert doubts.probability(sure, 0.6) == pytest.approx(0.99, abs=1e-3)
-    assert doubts.probability(sure, 0.1) == 0.1
-    assert doubts.probability(unsure, 0.1) == pytest.approx(0.052, abs=1e-3)
+    assert doubts.probability(fitted, sure, 0.6) == pytest.approx(0.99, abs=1e-3)
+    assert doubts.probability(fitted, sure, 0.1) == 0.1
+    assert doubts.probability(fitted, unsure, 0.1) == pytest.approx(0.052, abs=1e-3)
 
 
 def test_who_tried_one_start_is_told_of_the_search():

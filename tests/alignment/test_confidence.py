@@ -8,16 +8,20 @@ import numpy as np
 import pytest
 import solids
 
-from benchmarks import fit_confidence, reliability
-from cfr_jax.alignment import confidence
+from cfr_jax.alignment import confidence, doubts
+from cfr_jax.alignment.align import align
+from cfr_jax.alignment.answers import Alignment
 from cfr_jax.alignment.confidence import Clues, gather, of_alignment
 from cfr_jax.alignment.quality import Quality
-from cfr_jax.networks import calibration
+from cfr_jax.batch.stream import align_many
 from cfr_jax.networks.clues import NetworkClues, of_network, of_registration
+from cfr_jax.networks.probability import KEY, Calibration, calibration_of, uncalibrated
+from cfr_jax.weights.files import load_params
 
 OF_NETWORK = [field.name for field in dataclasses.fields(NetworkClues)]
 OF_SURFACES = [field.name for field in dataclasses.fields(Clues) if field.name != "network"]
 NAMES = OF_NETWORK + OF_SURFACES
+FITTED = calibration_of(load_params())
 POINTS = solids.lopsided(40, 0).points
 
 
@@ -88,7 +92,7 @@ def test_a_single_iteration_counts_as_settled_and_has_finite_slopes():
 
     def probability(transforms):
         arrays = (transforms, *map(jnp.float32, (POINTS, POINTS)), *[jnp.full(40, 0.5)] * 2)
-        return of_registration(of_network(*arrays))
+        return of_registration(FITTED, of_network(*arrays))
 
     slopes = jax.grad(probability)(jnp.eye(4)[None])
     assert np.isfinite(slopes).all()
@@ -112,52 +116,73 @@ def test_the_surfaces_tell_how_far_refining_went_and_how_the_answer_is_held():
     np.testing.assert_allclose([found["distance"], found["resistance"]], [0.4, 0.3], rtol=1e-6)
 
 
-def test_the_probability_is_the_logistic_of_the_weighted_clues(monkeypatch):
-    monkeypatch.setattr(calibration, "ALIGN", {"bias": -1.0, "fitness": 2.0, "settled": -0.5})
+def test_the_probability_is_the_logistic_of_the_weighted_clues():
+    fitted = Calibration.of({"bias": 0.0}, {"bias": -1.0, "fitness": 2.0, "settled": -0.5})
 
-    found = of_alignment(clues(fitness=0.75, settled=1.5))
+    found = of_alignment(fitted, clues(fitness=0.75, settled=1.5))
 
     assert found == pytest.approx(1 / (1 + np.exp(0.25)))
 
 
 @pytest.mark.parametrize("value", [-1e30, 1e30])
-def test_extreme_clues_give_a_probability(monkeypatch, value):
-    monkeypatch.setattr(calibration, "ALIGN", {"bias": 0.0, "fitness": 1.0})
+def test_extreme_clues_give_a_probability(value):
+    fitted = Calibration.of({"bias": 0.0}, {"bias": 0.0, "fitness": 1.0})
 
-    found = of_alignment(clues(fitness=value))
+    found = of_alignment(fitted, clues(fitness=value))
 
     assert found == pytest.approx(float(value > 0), abs=1e-9) and 0 <= found <= 1
 
 
-def test_what_ships_knows_its_clues_and_trusts_a_better_answer_more():
-    assert set(calibration.REGISTER) == {"bias", *OF_NETWORK}
-    assert set(calibration.ALIGN) == {"bias", *NAMES}
+@pytest.mark.parametrize("name", ["object", "scan"])
+def test_what_ships_knows_its_clues_and_trusts_a_better_answer_more(name):
+    fitted = calibration_of(load_params(name))
+    fitted.check("register", OF_NETWORK)
+    fitted.check("align", NAMES)
 
-    low = of_alignment(clues(distance=0.8, residual=-1.5, resistance=0.1))
-    high = of_alignment(clues(distance=0.4, residual=-2.5, resistance=0.5))
-    sure = of_registration(seen([10, 20, 20]))
-    unsure = of_registration(seen([10, 20, 60], off=0.2))
+    low = of_alignment(fitted, clues(distance=0.8, residual=-1.5, resistance=0.1))
+    high = of_alignment(fitted, clues(distance=0.4, residual=-2.5, resistance=0.5))
+    sure = of_registration(fitted, seen([10, 20, 20]))
+    unsure = of_registration(fitted, seen([10, 20, 60], off=0.2))
 
     assert 0 <= low < high <= 1 and 0 <= unsure < sure <= 1
 
 
-# --- how it is fitted and measured ---
+# --- weights that nobody calibrated ---
 
 
-def test_the_fit_finds_the_coefficients_that_made_the_answers():
-    rng = np.random.default_rng(0)
-    told = rng.normal(size=(20_000, 2)) * [1, 5] + [3, 0]
-    right = rng.random(len(told)) < 1 / (1 + np.exp(-(told @ [1.0, -0.2] - 2)))
-
-    np.testing.assert_allclose(fit_confidence.fit(told, right), [1.0, -0.2, -2], atol=0.15)
+@pytest.fixture(scope="module")
+def pair():
+    return solids.two_samplings(256, solids.motion(20))
 
 
-def test_a_true_probability_is_calibrated_and_a_bold_one_is_not():
-    rng = np.random.default_rng(0)
-    chance = rng.random(20_000)
-    right = rng.random(len(chance)) < chance
+def test_without_calibration_the_answer_is_the_same_and_its_confidence_is_unknown(pair):
+    # given the same weights with and without
+    calibrated, bare = load_params(), uncalibrated(load_params())
 
-    assert reliability.calibration_error(chance, right) < 0.02
-    assert reliability.calibration_error(np.round(chance), right) == pytest.approx(0.25, abs=0.02)
-    # of two uniform chances the right one is the larger with probability 5 / 6
-    assert reliability.ranking(chance[:2000], right[:2000]) == pytest.approx(5 / 6, abs=0.02)
+    # when
+    known, unknown = (align(*pair, params=params) for params in (calibrated, bare))
+    (many,) = align_many([pair], params=bare)
+
+    # then
+    np.testing.assert_array_equal(unknown.transform, known.transform)
+    assert known.trusted and not unknown.trusted and not many.alignment.trusted
+    assert unknown.confidence is many.alignment.confidence is None
+    for told in (unknown.warnings, many.alignment.warnings):
+        assert any("no calibration (`cfr calibrate` fits one)" in warning for warning in told)
+    assert not any("calibration" in warning for warning in known.warnings)
+
+
+def test_nothing_is_looked_at_twice_where_nothing_tells_which_answer_is_better(monkeypatch):
+    pair = solids.two_samplings(256, solids.motion(90, (-1, 1, 0)))
+
+    found = align(*pair, params=uncalibrated(load_params()))
+
+    assert found.starts == 1 and isinstance(found, Alignment)
+    assert doubts.probability(None, found.clues, 0.1) is None
+
+
+def test_a_calibration_of_other_clues_is_refused_before_anything_is_computed(pair):
+    fitted = Calibration.of({"bias": 0.0}, {"bias": 0.0, "luck": 1.0})
+
+    with pytest.raises(ValueError, match="calibration: align has other clues"):
+        align(*pair, params=load_params() | {KEY: fitted})

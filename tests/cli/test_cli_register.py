@@ -131,6 +131,21 @@ def test_json_on_standard_output_stands_alone_and_fits_its_schema(pair, answerin
     assert document["version"] == cfr_jax.__version__
 
 
+def test_without_calibration_the_confidence_is_null_and_strictly_not_trusted(
+    pair, answering, capsys
+):
+    answering(confidence=None, warnings=("not to be trusted: no calibration",))
+
+    code = main(["register", *pair, "--json", "-", "--strict"])
+
+    document = json.loads(capsys.readouterr().out)
+    jsonschema.validate(document, SCHEMA)
+    assert code == 3 and document["confidence"] is None and document["trusted"] is False
+    main(["register", *pair])
+    out = capsys.readouterr().out
+    assert "confidence  unknown" in out and "verdict     not trusted" in out
+
+
 def test_the_schema_is_sound_and_closed(pair, answering, capsys):
     # given
     jsonschema.Draft202012Validator.check_schema(SCHEMA)

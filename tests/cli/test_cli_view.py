@@ -64,6 +64,16 @@ def test_the_page_lies_beside_the_result_unless_told_otherwise(result, tmp_path,
     assert "warning     small clouds" in capsys.readouterr().out
 
 
+def test_a_result_of_weights_without_calibration_is_drawn(result, tmp_path):
+    change(tmp_path / "result.json", confidence=None)
+
+    document = saved.read_result(tmp_path / "result.json")
+    scene = saved.as_scene(document, result.source, result.target)
+
+    assert scene.facts["confidence"] == "unknown"
+    assert main(["view", str(tmp_path / "result.json")]) == 0
+
+
 def test_clouds_that_moved_together_with_the_result_are_found(result, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     for name in ("result.json", "source.ply", "target.xyz"):
@@ -123,7 +133,7 @@ def test_what_is_no_result_is_refused(text, told, tmp_path, capsys):
         ("transforms", [[[1, 0], [0, 1]]], "transforms"),
         ("transforms", None, '"transforms"'),
         ("source", {"name": "a"}, '"source" lies'),
-        ("confidence", None, "cannot be drawn"),
+        ("confidence", [], "cannot be drawn"),
         ("inlier_distance", "far", '"inlier_distance"'),
     ],
 )

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from cfr_jax.evaluation.methods import methods_of
+from cfr_jax.networks import table
 
 ROOT = Path(__file__).parents[2]
 ABLATIONS = ROOT / "configs" / "eval_ablations.py"
@@ -148,7 +149,7 @@ def test_without_normals_the_methods_are_the_same_and_none_is_given_any():
 
 
 def test_what_an_ablation_trains_is_what_it_measures():
-    from cfr_jax.evaluation.network import make_network
+    from cfr_jax.evaluation.solvers.network_solver import make_network
     from cfr_jax.training.learner import learner
 
     evaluations, trainings = read_module(ABLATIONS), read_module(ROOT / "configs" / "ablations.py")
@@ -157,7 +158,7 @@ def test_what_an_ablation_trains_is_what_it_measures():
         assert len(config.methods) == len(variants) == 2
         for method, (run, settings) in variants.items():
             entry = config.methods[method]
-            made = make_network(network="cfr", weights="object", **entry.options)
+            made = make_network(network=table.network("cfr"), weights="object", **entry.options)
             measured = made.args[1].settings
             if run:
                 assert run in evaluations.trainings(name)

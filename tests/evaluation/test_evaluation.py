@@ -23,9 +23,11 @@ from cfr_jax.evaluation.config import EvaluationConfig, MethodEntry, checked
 from cfr_jax.evaluation.datasets import read_pairs
 from cfr_jax.evaluation.drawing.tables import write_table
 from cfr_jax.evaluation.measuring import measure, only, summarize
-from cfr_jax.evaluation.methods import Answer, Method, clouds_of, make_baseline, methods_of
+from cfr_jax.evaluation.methods import Method, make_baseline, methods_of
 from cfr_jax.evaluation.running import run_method
+from cfr_jax.evaluation.solvers.solver import Answer, clouds_of
 from cfr_jax.evaluation.store import Record, Records
+from cfr_jax.networks import table
 
 ABOUT = {"use": "identity", "options": {}, "estimated_normals": False, "batch": 1, "threads": 1}
 
@@ -283,11 +285,15 @@ def test_pairs_of_some_frames_are_those_whose_both_frames_are_among_them(tmp_pat
 
 
 def test_the_code_of_a_network_is_told_apart_by_every_file_that_makes_its_answers():
-    """All that `evaluation.network` imports of the package, and what those import."""
+    """All that `evaluation.solvers.network_solver` imports of the package, and so on."""
     from cfr_jax.evaluation import methods
 
     loaded = subprocess.run(
-        [sys.executable, "-c", "import sys, cfr_jax.evaluation.network; print(*sys.modules)"],
+        [
+            sys.executable,
+            "-c",
+            "import sys, cfr_jax.evaluation.solvers.network_solver; print(*sys.modules)",
+        ],
         capture_output=True,
         text=True,
         check=True,
@@ -413,7 +419,7 @@ def test_the_gallery_shows_best_median_and_worst_and_no_pair_twice():
 def test_a_batch_answers_as_each_pair_alone(tmp_path, params, cascades):
     import jax.numpy as jnp
 
-    from cfr_jax.evaluation.network import make_network
+    from cfr_jax.evaluation.solvers.network_solver import make_network
     from cfr_jax.networks.cfr.registration import register
     from cfr_jax.weights.files import save_params
 
@@ -421,7 +427,7 @@ def test_a_batch_answers_as_each_pair_alone(tmp_path, params, cascades):
     save_params(tmp_path / "w.safetensors", params)
     pairs = [a_pair(seed, points=70) for seed in range(3)]
     solve = make_network(
-        network="cfr",
+        network=table.network("cfr"),
         weights=str(tmp_path / "w.safetensors"),
         refine=False,
         batch=2,
@@ -441,7 +447,7 @@ def test_a_batch_answers_as_each_pair_alone(tmp_path, params, cascades):
 
 
 def test_clouds_of_any_size_go_through_align(monkeypatch):
-    from cfr_jax.evaluation import network
+    from cfr_jax.evaluation.solvers import network_solver
 
     # given
     class Found:
@@ -454,12 +460,12 @@ def test_clouds_of_any_size_go_through_align(monkeypatch):
         asked.update(options, normals=source.normals)
         return Found
 
-    monkeypatch.setattr(network, "align", align)
-    monkeypatch.setattr(network, "load_params", lambda weights, network: {})
+    monkeypatch.setattr(network_solver, "align", align)
+    monkeypatch.setattr(network_solver, "load_params", lambda weights, network: {})
 
     # when
-    solve = network.make_network(
-        network="cfr",
+    solve = network_solver.make_network(
+        network=table.network("cfr"),
         weights="w",
         refine=True,
         through="align",
@@ -478,19 +484,23 @@ def test_clouds_of_any_size_go_through_align(monkeypatch):
 
 
 def test_a_network_goes_through_register_or_align_and_nothing_else(unchecked):
-    from cfr_jax.evaluation import network
+    from cfr_jax.evaluation.solvers import network_solver
 
     with pytest.raises(ValueError, match="through is 'luck'"):
-        network.make_network(network="cfr", weights="w", refine=True, through="luck")
+        network_solver.make_network(
+            network=table.network("cfr"), weights="w", refine=True, through="luck"
+        )
     with pytest.raises(ValueError, match="cascades is 0"):
-        network.make_network(network="cfr", weights="w", refine=True, cascades=0)
+        network_solver.make_network(
+            network=table.network("cfr"), weights="w", refine=True, cascades=0
+        )
 
 
 def a_network(tmp_path, network: str, **options):
     """A solver with random weights, eight neighbors and two iterations, and its parameters."""
     from oracle import authors
 
-    from cfr_jax.evaluation.network import make_network
+    from cfr_jax.evaluation.solvers.network_solver import make_network
     from cfr_jax.weights.authors import from_state_dict
     from cfr_jax.weights.files import save_params
 
@@ -498,7 +508,10 @@ def a_network(tmp_path, network: str, **options):
     params = from_state_dict(made(0))
     save_params(tmp_path / "w.safetensors", params)
     solve = make_network(
-        network=network, weights=str(tmp_path / "w.safetensors"), refine=False, **options
+        network=table.network(network),
+        weights=str(tmp_path / "w.safetensors"),
+        refine=False,
+        **options,
     )
     return solve, params
 
@@ -580,32 +593,30 @@ def test_a_prepared_cloud_has_the_size_of_the_network_and_its_padding_changes_no
 def test_the_modules_that_are_timed_are_those_of_a_registration(tmp_path, network):
     import jax.numpy as jnp
 
-    from cfr_jax.evaluation import modules
+    from cfr_jax.evaluation.solvers import module_times
     from cfr_jax.geometry import rigid
-    from cfr_jax.networks import inputs, rpmnet
+    from cfr_jax.networks import inputs, parts, rpmnet
     from cfr_jax.networks.cfr import iterations
 
     # given the parts of a registration of one iteration
     _, params = a_network(tmp_path, network)
     settings = {"neighbors": 8}
-    source, target = modules._clouds(a_pair(), estimated=True)
+    source, target = module_times._clouds(a_pair(), estimated=True)
     if network == "cfr":
         params["cascade"] = {name: leaf[:1] for name, leaf in params["cascade"].items()}
         out = params["annealing"]["out"]
         params["annealing"]["out"] = {name: leaf[..., [0, 5]] for name, leaf in out.items()}
         small = inputs.Settings(**settings)
-        parts = modules._Cfr(params, small)
         (motion,) = motions(iterations.unroll, params, source, target, small)
     else:
         small = rpmnet.RPMNetSettings(**settings, iterations=1)
-        parts = modules._Rpmnet(params, small)
         (motion,) = motions(rpmnet.unroll, params, source, target, small)
 
     # when the last part is run
-    *_, last = parts.of(source, target)
+    *_, last = table.network(network).parts(params, small)(source, target)
 
     # then it leaves the source where a registration does
-    assert last.module == modules.MOTION
+    assert last.module == parts.MOTION
     wanted = rigid.apply(jnp.asarray(motion), source.points)
     np.testing.assert_allclose(last.function(*last.arguments), wanted, atol=1e-5)
 
@@ -624,8 +635,9 @@ def test_each_module_is_counted_as_often_as_it_runs(
 ):
     from collections import Counter
 
-    from cfr_jax.evaluation import modules
-    from cfr_jax.networks import inputs, rpmnet
+    import jax
+
+    from cfr_jax.evaluation.solvers import module_times
 
     class Anything:  # a result that can be taken apart in every way
         def __getitem__(self, place):
@@ -634,12 +646,12 @@ def test_each_module_is_counted_as_often_as_it_runs(
         def __iter__(self):
             return iter((self, self))
 
-    monkeypatch.setattr(modules.jax, "jit", lambda function, **_: lambda *_: Anything())
+    monkeypatch.setattr(jax, "jit", lambda function, **_: lambda *_: Anything())
     _, params = a_network(tmp_path, network)
-    kind = {"cfr": inputs.Settings, "rpmnet": rpmnet.RPMNetSettings}[network]
-    parts = {"cfr": modules._Cfr, "rpmnet": modules._Rpmnet}[network](params, kind(**settings))
+    record = table.network(network)
+    parts = record.parts(params, record.settings(**settings))
     counted = Counter()
-    for part in parts.of(*modules._clouds(a_pair(), estimated=True)):
+    for part in parts(*module_times._clouds(a_pair(), estimated=True)):
         counted[part.module] += part.times
 
     assert tuple(counted.values()) == calls

@@ -5,12 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cfr_jax.networks.cfr.modules import group_norm
 from cfr_jax.networks.extraction import pooled_features
 from cfr_jax.networks.extraction.backward import backward
 from cfr_jax.networks.extraction.forward import forward
 from cfr_jax.networks.extraction.tiles import ACCELERATOR, CPU, Limits, tiling_of
-from cfr_jax.networks.layers import Layer
+from cfr_jax.networks.layers import Layer, group_norm
 
 N, K, WIDTH, GROUPS = 10, 4, 16, 4
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from oracle import pieces
 
-from cfr_jax.networks.cfr.modules import CFR, group_norm, init_params, unit_rows
+from cfr_jax.networks.cfr.modules import CFR, init_params
+from cfr_jax.networks.layers import group_norm, unit_rows
 
 
 def given(seed=0, dtype=np.float32):

@@ -384,6 +384,15 @@ def test_weights_to_start_from_have_the_iterations_that_are_asked_for(corpus_fil
         fresh_params(given, learner.learner(given))
 
 
+def test_the_calibration_of_weights_to_start_from_stays_behind(corpus_file):
+    given = config(corpus_file)
+    given.train.start_from, given.iterations = "object", 5
+
+    params = fresh_params(given, learner.learner(given))
+
+    assert params.keys() == {"annealing", "cascade", "features"}
+
+
 def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monkeypatch, whole):
     given, finish = config(corpus_file), Checkpoints._finish
 

@@ -8,6 +8,7 @@ from safetensors.numpy import load_file, save_file
 
 from cfr_jax.networks import rpmnet
 from cfr_jax.networks.cfr.modules import init_params
+from cfr_jax.networks.probability import KEY, Calibration, calibration_of
 from cfr_jax.weights import files as weights
 
 
@@ -34,6 +35,57 @@ def test_what_is_saved_comes_back_with_its_notes(fresh, saved):
     assert found.name == "mine" and len(found.sha256) == 64
     assert jax.tree.all(jax.tree.map(jnp.array_equal, weights.load_params(str(saved)), fresh))
     assert [path.name for path in saved.parent.iterdir()] == ["mine.safetensors"]
+
+
+def test_the_calibration_comes_back_with_the_weights(fresh, tmp_path):
+    # given weights of ours with the calibration of others
+    path = tmp_path / "calibrated.safetensors"
+    fitted = calibration_of(weights.load_params("object"))
+    weights.save_params(path, {**fresh, KEY: fitted}, {"made_by": "a test"})
+
+    # when
+    found = weights.read_weights(path)
+
+    # then
+    assert calibration_of(found.params) == fitted and found.notes == {"made_by": "a test"}
+    assert jax.tree.leaves(found.params)[0].dtype == jnp.float32
+    weights.save_params(tmp_path / "again.safetensors", found.params, found.notes)
+    assert weights.read_weights(tmp_path / "again.safetensors").sha256 == found.sha256
+    # other coefficients are other weights, and none are none
+    weights.save_params(path, fresh, {"made_by": "a test"})
+    bare = weights.read_weights(path)
+    assert calibration_of(bare.params) is None and bare.sha256 != found.sha256
+
+
+@pytest.mark.parametrize(
+    ("fitted", "told"),
+    [
+        ("nonsense", "the note is no JSON"),
+        ('{"register": {"bias": 1}, "align": {"bias": 1}}', "register has other clues than are"),
+    ],
+)
+def test_a_damaged_calibration_is_refused(fresh, tmp_path, monkeypatch, fitted, told):
+    # given a file whose digest fits, since it was written with that note
+    monkeypatch.setattr(Calibration, "write", lambda _: fitted)
+    path = tmp_path / "damaged.safetensors"
+    weights.save_params(path, {**fresh, KEY: Calibration.of({"bias": 0.0}, {"bias": 0.0})})
+
+    with pytest.raises(ValueError, match=f"^weights: .*damaged.safetensors: calibration: {told}"):
+        weights.read_weights(path)
+
+
+@pytest.mark.parametrize("name", [KEY, "sha256"])
+def test_notes_that_are_written_by_themselves_cannot_be_given(fresh, tmp_path, name):
+    with pytest.raises(ValueError, match=f"notes: got '{name}'"):
+        weights.save_params(tmp_path / "w.safetensors", fresh, {name: "{}"})
+    assert not list(tmp_path.iterdir())
+
+
+def test_tensors_of_no_network_are_refused(tmp_path):
+    path = tmp_path / "other.safetensors"
+    weights.save_params(path, {"nobody": np.zeros(3, np.float32)})
+    with pytest.raises(ValueError, match="other.*no network that is known .* tensors: nobody"):
+        weights.read_weights(path)
 
 
 def test_the_same_weights_have_the_same_digest_and_others_another(fresh, saved, tmp_path):

@@ -126,7 +126,7 @@ def quality(found: Any) -> dict[str, str]:
     """The figures a reader judges by, of an `Alignment` or of what has the same ones, written
     out."""
     return {
-        "confidence": f"{found.confidence:.2f}",
+        "confidence": "unknown" if found.confidence is None else f"{found.confidence:.2f}",
         "fitness": f"{found.fitness:.3f} of the source within {found.inlier_distance:.4g}",
         "inlier RMSE": f"{found.inlier_rmse:.4g}",
         "refined": "yes" if found.refined else "no",

@@ -7,7 +7,6 @@ between them.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import jax.numpy as jnp
 from flax import struct
@@ -18,7 +17,8 @@ from cfr_jax.geometry import rigid
 from cfr_jax.networks.cfr.modules import CFR
 from cfr_jax.networks.features import raw_features
 from cfr_jax.networks.inputs import Cloud, Settings, moved_by
-from cfr_jax.networks.sinkhorn import Affinity, Match, match
+from cfr_jax.networks.record import Step
+from cfr_jax.networks.sinkhorn import Affinity, match
 
 
 @struct.dataclass
@@ -27,14 +27,6 @@ class Encoded:
 
     cloud: Cloud
     features: Float[Array, "L m d"]
-
-
-class Step(NamedTuple):
-    """What one iteration found."""
-
-    transform: Float[Array, "4 4"]
-    match: Match
-    affinity: Affinity
 
 
 def iterate(
@@ -48,7 +40,7 @@ def iterate(
     network, count = bind(params), iterations_of(params)
     reference = target.cloud
     annealing = network.annealing(source.points, reference.points, source.mask, reference.mask)
-    received = features = _heavy_features(network, source, settings)
+    received = features = heavy_features(network, source, settings)
     moved = source
     for i in range(iterations):
         layer = min(i, count - 1)
@@ -57,7 +49,7 @@ def iterate(
                 moved.points, reference.points, source.mask, reference.mask
             )
         if i and settings.repeat_extraction:
-            received = _heavy_features(network, moved, settings)
+            received = heavy_features(network, moved, settings)
         elif i == layer:
             received = features
         features = network.cascade.layer(layer, received, moved.points, source.mask)
@@ -85,7 +77,7 @@ def moved_on(transform: Float[Array, "4 4"], source: Cloud, settings: Settings) 
 def encoded(params: dict, cloud: Cloud, settings: Settings) -> Encoded:
     """The features of a reference in every iteration."""
     network = bind(params)
-    heavy = _heavy_features(network, cloud, settings)
+    heavy = heavy_features(network, cloud, settings)
     if settings.repeat_extraction:
         layers = range(iterations_of(params))
         every = [network.cascade.layer(i, heavy, cloud.points, cloud.mask) for i in layers]
@@ -110,6 +102,7 @@ def bind(params: dict) -> CFR:
     return CFR(iterations_of(params), shared).bind({"params": params})
 
 
-def _heavy_features(network, cloud, settings):
+def heavy_features(network: CFR, cloud: Cloud, settings: Settings) -> Float[Array, "n d"]:
+    """What every iteration starts from, extracted once; before any light layer."""
     raw = raw_features(cloud.points, cloud.normals, cloud.neighbors, ppf=settings.ppf)
     return network.features(raw, cloud.mask, settings.activations)

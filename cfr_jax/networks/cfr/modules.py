@@ -6,32 +6,20 @@ k neighbors, d = 96 channels, L iterations.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from cfr_jax.networks.annealing import AnnealingNet
 from cfr_jax.networks.extraction import Activations, pooled_features
-from cfr_jax.networks.layers import Layer, apply_layer, group_norm
-from cfr_jax.networks.pooling import pooled_layer
+from cfr_jax.networks.layers import GROUPS, Layer, group_norm, kernel_init, unit_rows
 
 CHANNELS = 96
-GROUPS = 8
 RAW_CHANNELS = 7
 
-# What PyTorch's Linear starts from, as the published networks did.
-kernel_init = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+# As `kernel_init`, for parameters that are stacked on a leading axis.
 _stacked_init = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform", batch_axis=(0,))
-
-
-class Annealing(NamedTuple):
-    """How sharp (beta) and how far-reaching (alpha) the match of each iteration is."""
-
-    beta: Float[Array, " L"]
-    alpha: Float[Array, " L"]
 
 
 class PointFeatures(nn.Module):
@@ -106,61 +94,6 @@ class Cascade(nn.Module):
         return jnp.stack(every)
 
 
-class AnnealingNet(nn.Module):
-    """A PointNet on both clouds that gives the annealing parameters of all iterations at once."""
-
-    iterations: int
-
-    @nn.compact
-    def __call__(
-        self,
-        source: Float[Array, "n 3"],
-        target: Float[Array, "m 3"],
-        source_mask: Bool[Array, " n"] | None = None,
-        target_mask: Bool[Array, " m"] | None = None,
-    ) -> Annealing:
-        flagged = [
-            jnp.pad(source, ((0, 0), (0, 1))),
-            jnp.pad(target, ((0, 0), (0, 1)), constant_values=1),
-        ]
-        x = jnp.concatenate(flagged)
-        mask = _join_masks(source, target, source_mask, target_mask)
-        for i, width in enumerate((64, 64, 64, 128)):
-            x = nn.relu(
-                apply_layer(
-                    layer_of(self, f"point_{i}", x.shape[-1], width), x, groups=GROUPS, mask=mask
-                )
-            )
-        x = pooled_layer(
-            layer_of(self, "point_4", x.shape[-1], 1024), x, groups=2 * GROUPS, mask=mask
-        )[None]
-        for i, width in enumerate((512, 256)):
-            x = nn.relu(
-                apply_layer(layer_of(self, f"pair_{i}", x.shape[-1], width), x, groups=2 * GROUPS)
-            )
-        x = nn.softplus(nn.Dense(2 * self.iterations, kernel_init=kernel_init, name="out")(x)[0])
-        return Annealing(beta=x[: self.iterations], alpha=x[self.iterations :])
-
-
-def layer_of(module: nn.Module, name: str, inputs: int, width: int) -> Layer:
-    """The parameters of a Linear and its GroupNorm, as `name` in a module under construction."""
-    kernel, bias = _Linear(width, name=f"{name}_dense")(inputs)
-    scale = module.param(f"{name}_scale", nn.initializers.ones, (width,))
-    shift = module.param(f"{name}_shift", nn.initializers.zeros, (width,))
-    return Layer(kernel, bias, scale, shift)
-
-
-class _Linear(nn.Module):
-    """The parameters of a Dense, for those who apply them in their own way."""
-
-    width: int
-
-    @nn.compact
-    def __call__(self, inputs: int):
-        kernel = self.param("kernel", kernel_init, (inputs, self.width))
-        return kernel, self.param("bias", nn.initializers.zeros, (self.width,))
-
-
 class CFR(nn.Module):
     """Cascading feature extraction: the three learned parts under one roof."""
 
@@ -176,23 +109,6 @@ class CFR(nn.Module):
         """Touches every part once, so that `init` makes all parameters."""
         features = self.features(raw)
         return self.cascade.at_rest(features, source), self.annealing(source, target)
-
-
-def unit_rows(x: Float[Array, "n c"]) -> Float[Array, "n c"]:
-    """Rows scaled to length one; a row shorter than 1e-12 becomes zero, with zero gradient."""
-    square = jnp.sum(x * x, axis=-1, keepdims=True)
-    positive = square > 1e-24  # below, the cube in the derivative would overflow
-    return jnp.where(positive, x * lax.rsqrt(jnp.where(positive, square, 1)), 0)
-
-
-def _join_masks(source, target, source_mask, target_mask):
-    if source_mask is None and target_mask is None:
-        return None
-    masks = [
-        jnp.ones(cloud.shape[0], bool) if mask is None else mask
-        for cloud, mask in ((source, source_mask), (target, target_mask))
-    ]
-    return jnp.concatenate(masks)
 
 
 def init_params(key: jax.Array, iterations: int = 5, shared: bool = False) -> dict:

@@ -20,6 +20,7 @@ from cfr_jax.geometry import rigid
 from cfr_jax.networks.cfr.iterations import Encoded, encoded, iterate, iterations_of, moved_on
 from cfr_jax.networks.clues import NetworkClues, of_network, of_registration
 from cfr_jax.networks.inputs import Cloud, Settings, check_points, prepare
+from cfr_jax.networks.probability import calibration_of
 
 
 @struct.dataclass
@@ -41,9 +42,9 @@ class Registration:
     """Annealing: how far in feature space it reached."""
     clues: NetworkClues
     """What the confidence was estimated from."""
-    confidence: Float[Array, ""]
+    confidence: Float[Array, ""] | None
     """Estimated probability, in [0, 1], that `transform` is right to 5 degrees and 0.1; for clouds
-    of unit size, one cascade and the weights that ship."""
+    of unit size and one cascade. None where the parameters carry no calibration."""
 
     @property
     def transform(self) -> Float[Array, "*batch 4 4"]:
@@ -132,7 +133,8 @@ def _register(params, source, target, *, iterations, cascades, settings):
         source.mask,
         target.cloud.mask,
     )
-    return Registration(**of_all, **of_last, clues=clues, confidence=of_registration(clues))
+    confidence = of_registration(calibration_of(params), clues)
+    return Registration(**of_all, **of_last, clues=clues, confidence=confidence)
 
 
 def _prepared(name, cloud, settings):

@@ -1,6 +1,6 @@
 """Makes the pair of scans that ships with the package: two views of a fork lift.
 
-    python benchmarks/make_demo_pair.py PACKAGE_OR_LIBRARY [--out cfr_jax/demo]
+    python tools/make_demo_pair.py PACKAGE_OR_LIBRARY [--out cfr_jax/cli/demo_pair]
 
 takes `sweethome3d-furniture_1.8-1_all.deb` (`apt-get download sweethome3d-furniture`), or the
 `BlendSwap-CC-0.sh3f` in it. The category of the object, vehicles, is not among those trained on.
@@ -44,7 +44,7 @@ https://creativecommons.org/publicdomain/zero/1.0/) as Blend #90949, "Basic Low 
 on blendswap.com. It was taken from Debian's package `sweethome3d-furniture` 1.8-1,
 `{source}`. The scans are released under CC0 1.0 as well.
 
-Made by `benchmarks/make_demo_pair.py`: {how}
+Made by `tools/make_demo_pair.py`: {how}
 """
 HOW = (
     f"points drawn by area on the mesh at its true size (meters), those seen by a virtual depth "
@@ -57,7 +57,7 @@ HOW = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("package", type=Path, help="sweethome3d-furniture_*.deb or the .sh3f file")
-    parser.add_argument("--out", type=Path, default=Path("cfr_jax/demo"))
+    parser.add_argument("--out", type=Path, default=Path("cfr_jax/cli/demo_pair"))
     args = parser.parse_args()
 
     mesh, name, creator = fork_lift(args.package)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ def ranking(chance: np.ndarray, right: np.ndarray) -> float:
     return float(np.mean(above > 0) + np.mean(above == 0) / 2)
 
 
-def summary(chance: np.ndarray, right: np.ndarray) -> dict[str, float | int | list[float]]:
+def summary(chance: np.ndarray, right: np.ndarray) -> dict[str, Any]:
     """Both figures with 95% intervals from resampled pairs, and what trusting at 0.5 gives."""
     rng = np.random.default_rng(0)
     areas = []
@@ -40,9 +41,22 @@ def summary(chance: np.ndarray, right: np.ndarray) -> dict[str, float | int | li
         "roc_area": round(ranking(chance, right), 3),
         "roc_area_95": [round(float(v), 3) for v in np.quantile(areas, [0.025, 0.975])],
         "trusted": round(float(trusted.mean()), 3),
-        "right_of_trusted": round(float(right[trusted].mean()), 3),
-        "right_of_untrusted": round(float(right[~trusted].mean()), 3),
+        "right_of_trusted": _share(right[trusted]),
+        "right_of_untrusted": _share(right[~trusted]),
     }
+
+
+def in_words(measured: dict[str, Any]) -> str:
+    """A `summary` in a line."""
+    low, high = measured["roc_area_95"]
+    return (
+        f"right {measured['right']:.0%} of {measured['pairs']}, "
+        f"of those trusted {measured['right_of_trusted']:.0%}, "
+        f"of the others {measured['right_of_untrusted']:.0%}; "
+        f"{measured['calibration_error']:.3f} off "
+        f"({measured['calibration_error_by_chance']:.3f} by chance alone), "
+        f"ROC area {measured['roc_area']:.3f} ({low:.3f} to {high:.3f})"
+    )
 
 
 def draw(path: Path, curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
@@ -75,6 +89,10 @@ def draw(path: Path, curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
         axes.grid(alpha=0.3)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
+
+
+def _share(right):
+    return round(float(right.mean()), 3) if len(right) else 0.0
 
 
 def _bins(chance, right, bins):

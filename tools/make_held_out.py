@@ -1,6 +1,6 @@
 """Makes the shapes that `cfr reproduce` measures on, from CC0 models in Debian.
 
-    apt-get download sweethome3d-furniture && python benchmarks/make_held_out.py *.deb
+    apt-get download sweethome3d-furniture && python tools/make_held_out.py *.deb
 
 They are the shapes of the open corpus' `test.h5` (categories that no network was trained on) that
 their authors released under CC0: the library BlendSwap-CC-0. Points and normals are sampled as for
@@ -41,7 +41,7 @@ CC0 1.0 (public domain dedication, https://creativecommons.org/publicdomain/zero
 blendswap.com. They were taken from Debian's package `sweethome3d-furniture` 1.8-1,
 `{library}`, and are released under CC0 1.0 as well.
 
-Made by `benchmarks/make_held_out.py`: {points} points a shape, drawn by area, with the normals of
+Made by `tools/make_held_out.py`: {points} points a shape, drawn by area, with the normals of
 their faces, centered and scaled into the unit sphere; coordinates times 32767 as int16, normals
 times 127 as int8. All are of categories that the shipped weights were not trained on.
 
@@ -54,7 +54,7 @@ def main() -> None:
     """Writes `held_out.npz` and `held_out.md`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("package", type=Path, help="sweethome3d-furniture_*.deb or the .sh3f file")
-    parser.add_argument("--out", type=Path, default=Path("cfr_jax/models"))
+    parser.add_argument("--out", type=Path, default=Path("cfr_jax/weights/shipped"))
     args = parser.parse_args()
 
     shapes, categories, credits = [], [], CREDITS.format(

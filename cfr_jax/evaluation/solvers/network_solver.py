@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -18,30 +18,23 @@ from cfr_jax.alignment import solving
 from cfr_jax.alignment.align import align
 from cfr_jax.alignment.planning import planned
 from cfr_jax.data.pairs import Pair
-from cfr_jax.evaluation.methods import Answer, Solver, clouds_of
+from cfr_jax.evaluation.solvers.solver import Answer, Solver, clouds_of
 from cfr_jax.geometry import rigid
 from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.geometry.normals import estimate_normals
-from cfr_jax.networks import rpmnet
-from cfr_jax.networks.cfr.iterations import Step, unroll
+from cfr_jax.networks import table
 from cfr_jax.networks.inputs import Cloud, Settings, moved_by
+from cfr_jax.networks.record import Network
 from cfr_jax.refine import Refinement, find
 from cfr_jax.runtime import programs
 from cfr_jax.weights.files import load_params
-
-Unroll = Callable[[dict, Cloud, Cloud, Any], Iterator[Step]]
-KINDS: dict[str, tuple[Unroll, Any]] = {
-    "cfr": (unroll, Settings),
-    "rpmnet": (rpmnet.unroll, rpmnet.RPMNetSettings),
-}
-"""By name: its iterations, and the settings of these."""
 
 
 @dataclass(frozen=True)
 class Program:
     """All that is compiled in."""
 
-    unroll: Unroll
+    network: Network
     settings: Any
     refine: Refinement | None
     vectorized: int
@@ -50,7 +43,7 @@ class Program:
 
 def make_network(
     *,
-    network: str,
+    network: Network,
     weights: str,
     refine: bool | str,
     settings: dict[str, Any] | None = None,
@@ -63,7 +56,7 @@ def make_network(
     initial: Literal["global"] | None = None,
     seed: int = 0,
 ) -> Solver:
-    """A network of `KINDS` with these weights, `settings` other than its usual ones, with or
+    """A network with these weights, `settings` other than its usual ones, with or
     without refinement after its last iteration, `cascades` times one after the other.
 
     "register" takes the clouds as they are, `batch` pairs a call, `vectorized` of them at a time
@@ -76,9 +69,10 @@ def make_network(
         raise ValueError(f"through is {through!r}, wanted 'register', 'align' or 'preparation'")
     if cascades < 1:
         raise ValueError(f"cascades is {cascades}, wanted at least 1")
-    params = load_params(weights, network)
+    table.have(network)  # in a process of its own, the table has those of the package alone
+    params = load_params(weights, network.name)
     if through == "align":
-        if network != "cfr" or settings or cascades != 1:
+        if network.name != "cfr" or settings or cascades != 1:
             raise ValueError("through 'align' is CFR as it is; wanted 'preparation' for others")
         return functools.partial(
             _align_each,
@@ -91,11 +85,11 @@ def make_network(
         )
     if initial is not None:
         raise ValueError(f"initial is {initial!r}, which needs through='align'")
-    unroll, made = KINDS[network]
     refinement = find(refine)
     if refinement is not None and not refinement.traceable:
         raise ValueError(f"refine is {refine!r}, which needs through='align'")
-    program = Program(unroll, made(**settings or {}), refinement, vectorized, cascades)
+    made = network.settings(**settings or {})
+    program = Program(network, made, refinement, vectorized, cascades)
     if through == "preparation":
         return functools.partial(_prepare_each, params, program, estimated, max_points, seed)
     return functools.partial(_register_batches, params, program, estimated, batch)
@@ -175,8 +169,8 @@ def _stacked(program: Program, pairs: Sequence[Pair], estimated: bool) -> list[C
         if without and len(without) < len(clouds):
             raise ValueError("of one batch all clouds have normals or none; set batch to 1")
         k = min(settings.neighbors, len(points[0]) - 1)
-        if isinstance(settings, rpmnet.RPMNetSettings) and not without:
-            found = [np.zeros((len(cloud), 1), np.int32) for cloud in points]  # it has its own
+        if program.network.own_neighbors and not without:
+            found = [np.zeros((len(cloud), 1), np.int32) for cloud in points]
         else:
             found = [nearest_on_host(cloud, k, radius=settings.radius) for cloud in points]
         stacked.append(
@@ -223,7 +217,7 @@ def _transforms(
     """Of all cascades, each started where the one before it ended."""
 
     def cascade(start, _):
-        steps = program.unroll(params, moved_by(start, source), target, program.settings)
+        steps = program.network.unroll(params, moved_by(start, source), target, program.settings)
         transforms = jnp.stack([rigid.compose(step.transform, start) for step in steps])
         return transforms[-1], transforms
 

@@ -1,6 +1,6 @@
 """Measures shipped weights on the shapes that ship, and writes that into their card.
 
-    python benchmarks/model_card.py object
+    python tools/model_card.py object
 
 `cfr reproduce` holds later measurements against it. The card's other parts (what the weights are,
 their data, the scores of `evaluate.py`) are written by hand, and stay; of new weights, check them.

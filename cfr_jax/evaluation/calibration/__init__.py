@@ -1,0 +1,1 @@
+"""What a confidence is fitted with and measured by: trials, the fit, reliability."""

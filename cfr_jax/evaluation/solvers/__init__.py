@@ -1,0 +1,1 @@
+"""Methods as what solves pairs: what every solver answers, and the networks as solvers."""

@@ -1,0 +1,129 @@
+"""The record of CFR: what the table of networks says of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from cfr_jax.networks.annealing import AUTHORS_LAYERS
+from cfr_jax.networks.cfr.iterations import bind, heavy_features, iterations_of, unroll
+from cfr_jax.networks.cfr.modules import init_params
+from cfr_jax.networks.inputs import Cloud, Settings
+from cfr_jax.networks.parts import (
+    ANNEALING,
+    FEATURES,
+    MATCHING,
+    MOTION,
+    NEIGHBORS,
+    matching,
+    move,
+    on_host,
+)
+from cfr_jax.networks.record import Checkpoint, Network, Part, Place, places_of
+
+_LAYERS = (
+    *AUTHORS_LAYERS,
+    ("feat_extractor_ball.prepool.0", "features/kernel_0", "features/bias_0"),
+    ("feat_extractor_ball.prepool.1", "features/scale_0", "features/shift_0"),
+    ("feat_extractor_ball.prepool.3", "features/kernel_1", "features/bias_1"),
+    ("feat_extractor_ball.prepool.4", "features/scale_1", "features/shift_1"),
+    ("feat_extractor_ball.prepool.6", "features/kernel_2", "features/bias_2"),
+    ("feat_extractor_ball.prepool.7", "features/scale_2", "features/shift_2"),
+)
+_LAYERS_PER_ITERATION = (
+    # one of each for every iteration {}, stacked here on a leading axis
+    ("feat_extractor_xyz.nets_a.{}.0", "cascade/scale", "cascade/shift"),
+    ("feat_extractor_xyz.nets_a.{}.2", "cascade/kernel", "cascade/bias"),
+    ("feat_extractor_xyz.nets_b.{}.0", "cascade/position", None),
+)
+_ITERATION = re.compile(r"feat_extractor_xyz\.nets_a\.(\d+)\.")
+_PREFIXES = ("feat_extractor_ball.", "feat_extractor_xyz.")
+
+
+def _trained(neighbors: int, iterations: int) -> Settings:
+    # how many iterations there are stands in the parameters
+    return Settings(neighbors=neighbors, detach_motion=True)
+
+
+def _recognizes(tensors: Collection[str]) -> bool:
+    return any(name.startswith("cascade/") for name in tensors)
+
+
+def _arguments(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+    annealing = shapes.get("annealing/out/bias", (10,))
+    shared = shapes.get("cascade/kernel", ())[:1] == (1,)
+    return {"iterations": max(1, int(np.prod(annealing)) // 2), "shared": shared}
+
+
+def _theirs(tensors: Collection[str]) -> bool:
+    return any(name.startswith(_PREFIXES) for name in tensors)
+
+
+def _iterations_of_theirs(tensors: Collection[str]) -> dict[str, Any]:
+    return {"iterations": max(1, len({m[1] for m in map(_ITERATION.match, tensors) if m}))}
+
+
+def _places(tensors: Collection[str]) -> dict[str, Place]:
+    found = places_of(_LAYERS)
+    for i in range(_iterations_of_theirs(tensors)["iterations"]):
+        rows = [(theirs.format(i), *ours) for theirs, *ours in _LAYERS_PER_ITERATION]
+        found |= places_of(rows, stacked=True)
+    return found
+
+
+def parts(params: dict, settings: Settings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
+    """All parts of the registration of two clouds, for timing."""
+    network, count = bind(params), iterations_of(params)
+    heavy = jax.jit(lambda cloud: heavy_features(network, cloud, settings))
+    light = jax.jit(lambda *cloud: network.cascade.at_rest(*cloud))
+    anneal = jax.jit(lambda *clouds: network.annealing(*clouds))
+    matched = matching(settings.match)
+
+    def of(source: Cloud, target: Cloud) -> Iterator[Part]:
+        features = []
+        for cloud, again in ((source, settings.repeat_extraction), (target, False)):
+            points = np.asarray(cloud.points)
+            k = min(settings.neighbors, len(points) - 1)
+            yield Part(NEIGHBORS, on_host, (points, k, settings.radius))
+            yield Part(FEATURES, heavy, (cloud,), count if again else 1)
+            heavily = heavy(cloud)
+            yield Part(FEATURES, light, (heavily, cloud.points))
+            features.append(light(heavily, cloud.points))
+        pair = source.points, target.points
+        yield Part(ANNEALING, anneal, pair, count if settings.repeat_annealing else 1)
+        beta, alpha = anneal(*pair)
+        for i in range(count):
+            passes = i + 1 if settings.passes is None else settings.passes
+            given = (*(f[i] for f in features), beta[i], alpha[i], target.points, passes)
+            yield Part(MATCHING, matched, given)
+            yield Part(MOTION, move, (source.points, matched(*given)))
+
+    return of
+
+
+NETWORK = Network(
+    name="cfr",
+    title="CFR",
+    settings=Settings,
+    fresh=init_params,
+    unroll=unroll,
+    recognizes=_recognizes,
+    arguments=_arguments,
+    trained=_trained,
+    validated=Settings(),
+    iterations=iterations_of,
+    variants=("shared",),
+    # not those of the phases, of all training, and of its precision
+    changeable=tuple(
+        field.name
+        for field in dataclasses.fields(Settings)
+        if field.name not in ("neighbors", "detach_motion", "activations")
+    ),
+    parts=parts,
+    checkpoint=Checkpoint(_theirs, _iterations_of_theirs, _places),
+)
