@@ -1,7 +1,6 @@
 """The table of metrics: what it holds, and how one from outside is put there and shown."""
 
 import json
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -11,11 +10,10 @@ import solids
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation import metrics
 from cfr_jax.evaluation.comparison import compare
+from cfr_jax.evaluation.config import EvaluationConfig, MethodEntry
 from cfr_jax.evaluation.drawing.figures import by_iteration
 from cfr_jax.evaluation.measuring import measure, summarize
 from cfr_jax.evaluation.store import Record, Records
-
-CONFIG = Path(__file__).parents[2] / "configs" / "eval_open_cad.py"
 
 
 def farthest(estimates, pair):
@@ -47,24 +45,19 @@ def table(monkeypatch):
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory):
-    from importlib import util
-
-    spec = util.spec_from_file_location(CONFIG.stem, CONFIG)
-    module = util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     path = tmp_path_factory.mktemp("corpus") / "test.h5"
     points = np.random.default_rng(0).normal(size=(3, 900, 3)) * [1, 0.7, 0.5]
     with h5py.File(path, "w") as file:
         file["data"] = points.astype(np.float32)
         file["normal"] = (points / np.linalg.norm(points, axis=2, keepdims=True)).astype(np.float32)
         file["label"] = np.zeros(3, np.uint8)
-    config = module.get_config()
-    config.data.path, config.limit, config.threads = str(path), 3, 1
-    return config
+    data = {"kind": "corpus", "path": str(path), "protocol": "partial"}
+    methods = {name: MethodEntry(name, threads=1) for name in ("identity", "truth")}
+    return EvaluationConfig("title", data, methods)
 
 
 def test_a_metric_from_outside_stands_in_the_table_that_evaluate_writes(table, config, tmp_path):
-    text = compare(config, tmp_path, names=("identity", "truth"), plots=False)
+    text = compare(config, tmp_path, plots=False)
 
     header, _, identity, truth = text.splitlines()[4:8]
     place = [cell.strip() for cell in header.split("|")].index("worst point")

@@ -6,13 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import solids
-from ml_collections import ConfigDict
 from scipy.spatial import cKDTree
 
 from cfr_jax import cli, io, refine
 from cfr_jax.alignment.align import align
 from cfr_jax.batch.stream import align_many
 from cfr_jax.data.pairs import Pair
+from cfr_jax.evaluation.config import EvaluationConfig, MethodEntry
 from cfr_jax.evaluation.methods import methods_of
 from cfr_jax.refine.surfaces import Fit, HostSurface, Surface
 
@@ -136,8 +136,8 @@ def test_the_command_takes_it_by_name(table, pair, tmp_path, capsys, name):
 
 
 def test_a_config_takes_it_by_name(table, pair):
-    entry = {"use": "cfr", "options": {"refine": "toy", "through": "align"}}
-    config = ConfigDict({"methods": {"own": entry}, "threads": 0, "weights": "object"})
+    entry = MethodEntry("cfr", {"refine": "toy", "through": "align"})
+    config = EvaluationConfig("title", {"kind": "pairs"}, {"own": entry})
     (method,) = methods_of(config, (), seed=0)
 
     (answer,) = method.make()([Pair("pair", *pair)])
