@@ -20,9 +20,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from cfr_jax.data.corpus import Corpus, read_corpus
+from cfr_jax.data.corpus import Corpus
+from cfr_jax.data.kinds.kind import settings_of
 from cfr_jax.data.layout import recognize
-from cfr_jax.data.pairs import Pair, open_pairs
+from cfr_jax.data.pairs import Pair
 from cfr_jax.data.protocol import (
     crop,
     low_overlap,
@@ -139,10 +140,12 @@ def open_trials(path: str | Path, seed: int) -> Trials:
     Raises ValueError for other data.
     """
     layout = recognize(path)
-    if layout.kind == "corpus":
-        return OfShapes(read_corpus(path), seed)
-    if layout.kind in ("pair-list", "pair-file"):
-        return OfPairs(open_pairs(path), seed)
+    kind = layout.kind
+    if kind.read_shapes is not None:
+        return OfShapes(kind.read_shapes(Path(path)), seed)
+    # pairs that need no settings: their files say which clouds and which truth
+    if kind.evaluate is not None and not settings_of(kind.evaluate)[0]:
+        return OfPairs(kind.evaluate(path, Path()), seed)
     raise ValueError(
         f"data: {layout}; wanted a list or an HDF5 file of pairs with their transforms, or a "
         "corpus of shapes (`cfr data build` makes one of meshes)"
