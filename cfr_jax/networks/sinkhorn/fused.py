@@ -6,7 +6,8 @@ exchanged. So a pass makes the block twice. On paper that pays only where the bl
 device: an H200 reads 12,000^2 stored numbers in 0.13 ms and makes them by float32 products in
 0.5 ms or more (2 n m d = 28 GFLOP, 60 TFLOP/s), so `match` chooses it nowhere by itself.
 
-Elsewhere than on GPUs the kernels are interpreted, which is slow and gives the same answers.
+Elsewhere than on GPUs the kernels are interpreted, which is slow and gives the same answers. JAX
+0.11 warns that it will drop the Triton backend of Pallas.
 """
 
 from __future__ import annotations
