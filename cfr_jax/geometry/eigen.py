@@ -1,8 +1,8 @@
-"""Eigenvectors of small symmetric matrices: all of a 3x3, for normals, and the leading one, for
-rotations.
+"""Small symmetric matrices: all eigenvectors of a 3x3, for normals; the leading one of a 4x4, for
+rotations; the solution of a 6x6 system, for steps.
 
-`jnp.linalg.eigh` calls a solver made for large matrices: a batch of 3x3 takes longer there than the
-whole network on a GPU. Cyclic Jacobi (Golub & Van Loan, ch. 8.5) never fails, needs no branch, and
+`jnp.linalg` calls solvers made for large matrices: a batch of 3x3 takes longer there than the whole
+network on a GPU. Cyclic Jacobi (Golub & Van Loan, ch. 8.5) never fails, needs no branch, and
 written out by components it is plain vector arithmetic over a batch. A single eigenvector takes
 less: the power method, its powers by squaring.
 """
@@ -67,29 +67,46 @@ def leading_eigenvector(
     return vector
 
 
-def _repeated(step: Callable[[Any], Any], count: int, state: Any) -> Any:
-    """`step` done `count` times. Accelerators get it written out: in a loop, each number that is
-    carried would be copied by a kernel of its own. On a CPU a loop compiles faster."""
+@jax.jit
+def solve_positive(matrix: Float[Array, "d d"], right: Float[Array, " d"]) -> Float[Array, " d"]:
+    """x with matrix x = right, for a symmetric positive definite matrix.
+
+    Gauss-Jordan elimination: no pivot needs to be searched where all are positive.
+    """
+    rows = jnp.concatenate([matrix, right[:, None]], axis=1)
+    return _repeated(_eliminate, len(matrix), rows)[:, -1]
+
+
+def _eliminate(k, rows):
+    pivot = rows[k] / rows[k, k]
+    column = lax.dynamic_slice_in_dim(rows, k, 1, axis=1)
+    own = jnp.arange(len(rows))[:, None] == k
+    return jnp.where(own, pivot, rows - column * pivot)
+
+
+def _repeated(step: Callable[[Any, Any], Any], count: int, state: Any) -> Any:
+    """`step(i, state)` for i below `count`. Accelerators get it written out: in a loop, each number
+    that is carried would be copied by a kernel of its own. On a CPU a loop compiles faster."""
 
     def looped(state):
-        return lax.fori_loop(0, count, lambda _, state: step(state), state)
+        return lax.fori_loop(0, count, step, state)
 
     def written_out(state):
-        for _ in range(count):
-            state = step(state)
+        for i in range(count):
+            state = step(i, state)
         return state
 
     return lax.platform_dependent(state, cpu=looped, default=written_out)
 
 
 @jax.jit
-def _squared(power):
+def _squared(_, power):
     square = jnp.sum(power[:, :, None] * power[None, :, :], axis=1)
     return square / jnp.trace(square)
 
 
 @jax.jit
-def _sweep(state):
+def _sweep(_, state):
     entries, vectors = state
     d = max(row for row, _ in vectors) + 1
     for p in range(d):

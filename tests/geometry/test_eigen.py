@@ -12,6 +12,7 @@ from cfr_jax.geometry.eigen import (
     SWEEPS,
     leading_eigenvector,
     least_direction,
+    solve_positive,
     symmetric_eigen,
 )
 
@@ -153,3 +154,21 @@ def test_the_least_direction_has_a_finite_derivative_everywhere(diagonal):
 
     assert np.isfinite(gradient).all()
     np.testing.assert_allclose(np.linalg.norm(least_direction(covariance)), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("smallest", [1.0, 1e-3, 1e-6])
+def test_a_positive_system_is_solved_as_well_as_by_lapack(smallest):
+    values = np.geomspace(1, smallest, 6)
+    matrices = symmetric(np.random.default_rng(6), values, count=200)
+    right = np.random.default_rng(7).normal(size=(200, 6)).astype(np.float32)
+
+    found, theirs = (
+        jax.jit(jax.vmap(solver))(jnp.asarray(matrices), jnp.asarray(right))
+        for solver in (solve_positive, jnp.linalg.solve)
+    )
+
+    wanted = np.linalg.solve(matrices.astype(np.float64), right[..., None].astype(np.float64))
+    off, theirs_off = (np.linalg.norm(x - wanted[..., 0], axis=1) for x in (found, theirs))
+    length = np.linalg.norm(wanted[..., 0], axis=1)
+    assert np.median(off / length) < 1.2 * np.median(theirs_off / length) + 1e-7
+    assert np.max(off / length) < 1.5 * np.max(theirs_off / length) + 1e-6
