@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cfr_jax.geometry import rigid
 from cfr_jax.geometry.closest import closest
+from cfr_jax.refine.generalized_icp import squared_distances
 from cfr_jax.refine.surfaces import Surface
 
 _HIGHEST = lax.Precision.HIGHEST
@@ -80,21 +81,17 @@ def measure(
     _, directions = jnp.linalg.eigh(information)  # ascending
     weakest = directions[:, :_WEAKEST].T
 
-    def resistance(direction):
-        def nudged(step):
-            motion = rigid.exp(step * direction)
-            return _truncated(source, target, rigid.compose(motion, transform), distance)
-
-        steps = jnp.array([-_TEXTURE, _TEXTURE, -_NUDGE, _NUDGE], moved.dtype)
-        near_back, near_ahead, back, ahead = lax.map(nudged, steps)
-        near = (near_back + near_ahead) / 2
-        rise = jnp.minimum(back, ahead) - near
-        return jnp.clip(rise / jnp.maximum(1 - near, _LEAST), 0, 1)
+    nudges = jnp.array([-_TEXTURE, _TEXTURE, -_NUDGE, _NUDGE], moved.dtype)
+    twists = (weakest[:, None] * nudges[:, None]).reshape(-1, 6)
+    nudged = jax.vmap(lambda twist: rigid.compose(rigid.exp(twist), transform))(twists)
+    lost = _truncated(source, target, nudged, distance).reshape(-1, len(nudges))
+    near = (lost[:, 0] + lost[:, 1]) / 2
+    rise = jnp.minimum(lost[:, 2], lost[:, 3]) - near
 
     return Quality(
         fitness=count / valid,
         inlier_rmse=rmse,
-        resistance=lax.map(resistance, weakest),
+        resistance=jnp.clip(rise / jnp.maximum(1 - near, _LEAST), 0, 1),
         weakest=weakest,
         overlap=jnp.sum(seen, dtype=count.dtype) / valid,
         moments=jnp.matmul(partners.T, partners * counted[:, None], precision=_HIGHEST),
@@ -151,12 +148,13 @@ def mutual_fit(
     return (there + covered(target, source, rigid.invert(transform))) / 2
 
 
-def _truncated(source, target, transform, distance):
-    """Mean over the source of the squared distance to the target, truncated; in [0, 1]."""
-    found = closest(rigid.apply(transform, source.points), target.points, target.mask)
-    truncated = jnp.minimum(found.square / distance**2, 1)
+def _truncated(source, target, transforms, distance):
+    """Mean over the source of the squared distance to the target, truncated, under each of the
+    `transforms`; in [0, 1]."""
+    square = squared_distances(source, target, transforms)
+    truncated = jnp.minimum(square / distance**2, 1)
     valid = source.mask.astype(truncated.dtype)
-    return jnp.sum(truncated * valid) / jnp.maximum(jnp.sum(valid), 1)
+    return jnp.sum(truncated * valid, axis=1) / jnp.maximum(jnp.sum(valid), 1)
 
 
 def _pointwise_information(points, weights):

@@ -27,7 +27,7 @@ from cfr_jax.networks.clues import NetworkClues
 from cfr_jax.networks.inputs import Cloud, Settings, prepare
 from cfr_jax.networks.probability import Calibration
 from cfr_jax.refine import Refinement, generalized_icp
-from cfr_jax.refine.generalized_icp import score
+from cfr_jax.refine.generalized_icp import scores
 from cfr_jax.refine.surfaces import Surface
 from cfr_jax.runtime import programs
 
@@ -74,7 +74,7 @@ def solve(params: Mapping, source: Cloud, target: Encoded, *, refine: Refinement
     if refine is not None:
         refined = refine(*surfaces, transform)
         start = jnp.eye(4, dtype=transform.dtype)
-        kept, moved = (score(*surfaces, motion, DISTANCE) for motion in (start, refined.transform))
+        kept, moved = scores(*surfaces, jnp.stack([start, refined.transform]), DISTANCE)
         stays = kept < moved
         transform = jnp.where(stays, start, refined.transform)
         improved, steps = refined.improved | stays, refined.steps
@@ -95,7 +95,7 @@ def replaced(
     """`found` with another refinement's `transform` instead, unless that fits worse."""
     cloud = target.prepared()
     surfaces = surface(source.prepared()), surface(cloud)
-    before, after = (score(*surfaces, motion, DISTANCE) for motion in (found.transform, transform))
+    before, after = scores(*surfaces, jnp.stack([found.transform, transform]), DISTANCE)
     improved = after <= before
     transform = jnp.where(improved, transform, found.transform)
     measured, clues = _judge(found.registration, transform, cloud, surfaces)

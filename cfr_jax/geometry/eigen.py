@@ -1,11 +1,17 @@
-"""Eigenvectors of small symmetric matrices, for rotations (4x4) and normals (3x3).
+"""Small symmetric matrices: all eigenvectors of a 3x3, for normals; the leading one of a 4x4, for
+rotations; the solution of a 6x6 system, for steps.
 
-`jnp.linalg.eigh` calls a solver made for large matrices: a batch of 3x3 takes longer there than the
-whole network on a GPU. Cyclic Jacobi (Golub & Van Loan, ch. 8.5) never fails, needs no branch, and
-written out by components it is plain vector arithmetic over a batch.
+`jnp.linalg` calls solvers made for large matrices: a batch of 3x3 takes longer there than the whole
+network on a GPU. Cyclic Jacobi (Golub & Van Loan, ch. 8.5) never fails, needs no branch, and
+written out by components it is plain vector arithmetic over a batch. A single eigenvector takes
+less: the power method, its powers by squaring.
 """
 
 from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +19,17 @@ from jax import lax
 from jaxtyping import Array, Float
 
 # Converges quadratically: on random matrices, on rank-deficient ones and on ones with repeated
-# eigenvalues the fifth sweep no longer changes a float32 result (tests/test_eigen.py).
-_SWEEPS = 5
+# eigenvalues the fifth sweep no longer changes a float32 result (tests/geometry/test_eigen.py).
+SWEEPS = 5
+# The power 2^20 tells eigenvalues apart that differ by a millionth of the largest: nothing closer
+# has a meaning in float32.
+SQUARINGS = 20
 _HIGHEST = lax.Precision.HIGHEST
 
 
-@jax.jit  # so that its many scalars are traced once
+@functools.partial(jax.jit, static_argnames=("sweeps",))  # so that its many scalars are traced once
 def symmetric_eigen(
-    matrix: Float[Array, "d d"],
+    matrix: Float[Array, "d d"], *, sweeps: int = SWEEPS
 ) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
     """Eigenvalues, in no order, and their unit eigenvectors as columns.
 
@@ -31,17 +40,79 @@ def symmetric_eigen(
     entries = {(i, j): matrix[i, j] for i in range(d) for j in range(i, d)}
     one, zero = jnp.ones((), matrix.dtype), jnp.zeros((), matrix.dtype)
     vectors = {(i, j): one if i == j else zero for i in range(d) for j in range(d)}
-
-    def sweep(_, state):
-        entries, vectors = state
-        for p in range(d):
-            for q in range(p + 1, d):
-                entries, vectors = _turn(entries, vectors, p, q, d)
-        return entries, vectors
-
-    entries, vectors = lax.fori_loop(0, _SWEEPS, sweep, (entries, vectors))
+    entries, vectors = _repeated(_sweep, sweeps, (entries, vectors))
     values = jnp.stack([entries[i, i] for i in range(d)])
     return values, jnp.stack([vectors[i, j] for i in range(d) for j in range(d)]).reshape(d, d)
+
+
+@functools.partial(jax.jit, static_argnames=("squarings",))
+def leading_eigenvector(
+    matrix: Float[Array, "d d"], *, squarings: int = SQUARINGS
+) -> Float[Array, " d"]:
+    """An eigenvector, of any length but zero, of the largest eigenvalue of a symmetric matrix whose
+    eigenvalues sum to zero.
+
+    Where the largest eigenvalues agree, a vector that they share; the first axis for zero. Not
+    meant to be differentiated, as `symmetric_eigen`.
+    """
+    identity = jnp.eye(len(matrix), dtype=matrix.dtype)
+    size = jnp.sqrt(jnp.sum(matrix * matrix))
+    # As the eigenvalues sum to zero, half the norm lifts the largest above the absolute value of
+    # the smallest, so that it leads in the powers, too.
+    lifted = jnp.where(size > 0, matrix + size / 2 * identity, jnp.diag(identity[0]))
+    power = _repeated(_squared, squarings, lifted)
+    vector = power[jnp.argmax(jnp.diagonal(power))]
+    for _ in range(2):  # what the squares have gathered of rounding shrinks under the matrix itself
+        vector = jnp.sum(lifted * vector, axis=1)
+    return vector
+
+
+@jax.jit
+def solve_positive(matrix: Float[Array, "d d"], right: Float[Array, " d"]) -> Float[Array, " d"]:
+    """x with matrix x = right, for a symmetric positive definite matrix.
+
+    Gauss-Jordan elimination: no pivot needs to be searched where all are positive.
+    """
+    rows = jnp.concatenate([matrix, right[:, None]], axis=1)
+    return _repeated(_eliminate, len(matrix), rows)[:, -1]
+
+
+def _eliminate(k, rows):
+    pivot = rows[k] / rows[k, k]
+    column = lax.dynamic_slice_in_dim(rows, k, 1, axis=1)
+    own = jnp.arange(len(rows))[:, None] == k
+    return jnp.where(own, pivot, rows - column * pivot)
+
+
+def _repeated(step: Callable[[Any, Any], Any], count: int, state: Any) -> Any:
+    """`step(i, state)` for i below `count`. Accelerators get it written out: in a loop, each number
+    that is carried would be copied by a kernel of its own. On a CPU a loop compiles faster."""
+
+    def looped(state):
+        return lax.fori_loop(0, count, step, state)
+
+    def written_out(state):
+        for i in range(count):
+            state = step(i, state)
+        return state
+
+    return lax.platform_dependent(state, cpu=looped, default=written_out)
+
+
+@jax.jit
+def _squared(_, power):
+    square = jnp.sum(power[:, :, None] * power[None, :, :], axis=1)
+    return square / jnp.trace(square)
+
+
+@jax.jit
+def _sweep(_, state):
+    entries, vectors = state
+    d = max(row for row, _ in vectors) + 1
+    for p in range(d):
+        for q in range(p + 1, d):
+            entries, vectors = _turn(entries, vectors, p, q, d)
+    return entries, vectors
 
 
 def _turn(entries, vectors, p, q, d):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from cfr_jax.geometry.eigen import symmetric_eigen
+from cfr_jax.geometry.eigen import leading_eigenvector, symmetric_eigen
 
 _HIGHEST = lax.Precision.HIGHEST
 
@@ -86,9 +86,8 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """The proper rotation R that maximizes trace(R^T matrix).
 
     Horn (1987): the quaternion of R is the leading eigenvector of a symmetric 4x4 matrix linear in
-    `matrix`. Reflections need no case of their own, Jacobi rotations always return a unit vector,
-    and no step divides by a singular value: every finite matrix has an answer (zero gives the
-    identity).
+    `matrix`. Reflections need no case of their own, and no step divides by a singular value: every
+    finite matrix has an answer (zero gives the identity).
 
     The derivative does not pass through the eigenvectors. With P = R^T matrix (symmetric at the
     optimum), dR = R [w]x where (tr(P) I - P) w = vee(R^T dmatrix - dmatrix^T R). That system is
@@ -105,8 +104,7 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
             [yx - xy, xz + zx, yz + zy, zz - xx - yy],
         ]
     )
-    values, vectors = symmetric_eigen(horn)
-    return from_quaternion(vectors[:, jnp.argmax(values)])
+    return from_quaternion(leading_eigenvector(horn))
 
 
 @nearest_rotation.defjvp

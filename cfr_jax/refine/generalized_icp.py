@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cfr_jax.geometry import rigid
 from cfr_jax.geometry.closest import closest
+from cfr_jax.geometry.eigen import solve_positive
 from cfr_jax.refine.surfaces import Fit, Surface
 
 _HIGHEST = lax.Precision.HIGHEST
@@ -52,7 +53,7 @@ def refine(
     cut).
     """
     transform, steps, settled = descend(source, target, initial, stages)
-    before, after = (score(source, target, t, stages[-1].cut) for t in (initial, transform))
+    before, after = scores(source, target, jnp.stack([initial, transform]), stages[-1].cut)
     improved = after <= before
     return Fit(jnp.where(improved, transform, initial), improved, settled, steps)
 
@@ -79,17 +80,28 @@ def descend(
     return transform, jnp.sum(steps), settled[-1]
 
 
-def score(
-    source: Surface, target: Surface, transform: Float[Array, "4 4"], cut: float
-) -> Float[Array, ""]:
-    """Mean over the source of Tukey's biweight loss of the distance to the target; in [0, 1].
+def scores(
+    source: Surface, target: Surface, transforms: Float[Array, "k 4 4"], cut: float
+) -> Float[Array, " k"]:
+    """Mean over the source of Tukey's biweight loss of the distance to the target, under each of
+    the `transforms`; in [0, 1].
 
     It is 1 - (1 - d^2 / cut^2)^3, and 1 beyond the cut: what the weights of a descent belong to.
     """
-    found = closest(rigid.apply(transform, source.points), target.points, target.mask)
-    loss = 1 - jnp.maximum(1 - found.square / cut**2, 0) ** 3
+    square = squared_distances(source, target, transforms)
+    loss = 1 - jnp.maximum(1 - square / cut**2, 0) ** 3
     valid = source.mask.astype(loss.dtype)
-    return jnp.sum(loss * valid) / jnp.maximum(jnp.sum(valid), 1)
+    return jnp.sum(loss * valid, axis=1) / jnp.maximum(jnp.sum(valid), 1)
+
+
+def squared_distances(
+    source: Surface, target: Surface, transforms: Float[Array, "k 4 4"]
+) -> Float[Array, "k n"]:
+    """From each point of the source, moved by each of the `transforms`, to the closest of the
+    target: one search for all of them."""
+    moved = jax.vmap(rigid.apply, (0, None))(transforms, source.points)
+    found = closest(moved.reshape(-1, 3), target.points, target.mask)
+    return found.square.reshape(moved.shape[:2])
 
 
 def _run_stage(source, target, transform, stage):
@@ -145,7 +157,7 @@ def solve(system: Float[Array, "6 6"], pull: Float[Array, " 6"]) -> Float[Array,
     """The step: a left twist, rotation first."""
     # keeps directions that nothing determines (a line turning about itself) at rest
     damping = 1e-6 * jnp.trace(system) + jnp.finfo(system.dtype).tiny
-    return -jnp.linalg.solve(system + damping * jnp.eye(6, dtype=system.dtype), pull)
+    return -solve_positive(system + damping * jnp.eye(6, dtype=system.dtype), pull)
 
 
 def _plane(normals, thickness):

@@ -156,7 +156,7 @@ def _equations(
 
 
 def _score(source, target, transform, cut):
-    """`generalized_icp.score` by the tree."""
+    """`generalized_icp.scores` of one motion, by the tree."""
     distance, _ = _pairs(source, target, transform, cut)
     return float(np.mean(1 - (1 - np.minimum(distance / cut, 1) ** 2) ** 3))
 

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import pytest
 
 from cfr_jax.alignment.solving import DeviceCloud, solve_pair
+from cfr_jax.geometry import rigid
+from cfr_jax.geometry.eigen import least_direction
 from cfr_jax.networks.cfr.modules import CHANNELS, init_params
 from cfr_jax.networks.cfr.registration import Settings, encode, register
 from cfr_jax.networks.sinkhorn import Form
@@ -99,3 +101,20 @@ def test_distances_and_matches_are_computed_at_full_precision(params, name):
         else:
             assert LEARNED & set(sum(sizes, ())) or line.count("HIGHEST") == 2, line
     assert found >= 2 * L
+
+
+@pytest.mark.parametrize(
+    ("function", "sizes"),
+    [(rigid.nearest_rotation, [(3, 3)]), (jax.vmap(least_direction), [(N, 3, 3)])],
+    ids=["rotation", "normals"],
+)
+def test_small_eigenproblems_are_loops_on_a_cpu_and_straight_lines_elsewhere(function, sizes):
+    """A GPU would copy every number that a loop carries by a kernel of its own."""
+    traced = jax.jit(function).trace(*(shape(*size) for size in sizes))
+
+    loops = {
+        platform: traced.lower(lowering_platforms=(platform,)).as_text().count("stablehlo.while")
+        for platform in ("cpu", *PLATFORMS)
+    }
+
+    assert loops == {"cpu": 1, "cuda": 0, "tpu": 0}

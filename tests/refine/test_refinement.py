@@ -1,7 +1,5 @@
 """Generalized ICP: what it recovers, what it never does, and an independent minimizer."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +15,11 @@ from cfr_jax.refine.surfaces import Surface
 
 SIZE = 512
 REFINE = jax.jit(generalized_icp.refine, static_argnames=("stages",))
-SCORE = jax.jit(functools.partial(generalized_icp.score, cut=generalized_icp.CUT))
+
+
+@jax.jit
+def SCORE(source, target, transform):  # noqa: N802
+    return generalized_icp.scores(source, target, transform[None], generalized_icp.CUT)[0]
 
 
 def surface(sampled, transform=None):

@@ -57,8 +57,11 @@ def encode(
 ) -> Encoded:
     """The features of a reference in every iteration; hand it to `register` as the target, with the
     same settings. Raises ValueError as `register` does."""
-    _check_values("target", target)
-    return _encode(params, target, settings=settings)
+    clouds = {"target": target}
+    finite = _checked(clouds)
+    encoded = _encode(params, target, settings=settings)
+    _refuse_unless(finite, clouds)
+    return encoded
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
@@ -87,11 +90,13 @@ def register(
     choice of neighbors. Raises ValueError on wrong shapes, and for values that are no finite
     numbers, where they can be seen: inside `jit` and `vmap` they cannot, and NaN in gives NaN out.
     """
-    _check_values("source", source)
-    _check_values("target", target)
-    return _register(
+    clouds = {"source": source, "target": target}
+    finite = _checked(clouds)
+    found = _register(
         params, source, target, iterations=iterations, cascades=cascades, settings=settings
     )
+    _refuse_unless(finite, clouds)
+    return found
 
 
 @functools.partial(jax.jit, static_argnames=("iterations", "cascades", "settings"))
@@ -144,19 +149,45 @@ def _prepared(name, cloud, settings):
     return prepare(cloud, settings=settings)
 
 
-def _check_values(name, cloud):
-    """What a compiled function cannot tell: kinds and values, where they are known by now."""
-    if isinstance(cloud, Cloud | Encoded | jax.core.Tracer):
-        return
-    if not isinstance(cloud, np.ndarray | jax.Array):
-        raise ValueError(
-            f"{name}: got a {type(cloud).__name__}, wanted an array (n, 3) or (n, 6), "
-            "or what `prepare` or `encode` returned"
-        )
-    check_points(name, cloud)
-    if cloud.dtype.kind not in "fiu":
-        raise ValueError(f"{name}: got {cloud.dtype}, wanted floats or integers")
-    wrong = np.flatnonzero(~np.isfinite(np.asarray(cloud, np.float64)).all(axis=1))
+def _checked(clouds):
+    """Refuses what a compiled function cannot tell, where it is known by now. What is on the device
+    stays there: the answer is one flag that it makes, whether those values are finite."""
+    on_device = []
+    for name, cloud in clouds.items():
+        if isinstance(cloud, Cloud | Encoded | jax.core.Tracer):
+            continue
+        if not isinstance(cloud, np.ndarray | jax.Array):
+            raise ValueError(
+                f"{name}: got a {type(cloud).__name__}, wanted an array (n, 3) or (n, 6), "
+                "or what `prepare` or `encode` returned"
+            )
+        check_points(name, cloud)
+        if cloud.dtype.kind not in "fiu":
+            raise ValueError(f"{name}: got {cloud.dtype}, wanted floats or integers")
+        if isinstance(cloud, np.ndarray):
+            _check_finite(name, cloud)
+        else:
+            on_device.append(cloud)
+    with jax.ensure_compile_time_eval():  # while a caller is traced, what it knows has its values
+        return _all_finite(on_device) if on_device else None
+
+
+@jax.jit
+def _all_finite(clouds):
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(cloud)) for cloud in clouds]))
+
+
+def _refuse_unless(finite, clouds):
+    """Raises ValueError for values on the device that are not finite. To be asked when the work has
+    been handed to the device: only the flag is waited for, and rows are fetched for the message."""
+    if finite is not None and not jax.device_get(finite):
+        for name, cloud in clouds.items():
+            if isinstance(cloud, jax.Array) and not isinstance(cloud, jax.core.Tracer):
+                _check_finite(name, jax.device_get(cloud))
+
+
+def _check_finite(name, cloud):
+    wrong = np.flatnonzero(~np.isfinite(cloud).all(axis=1))
     if len(wrong):
         raise ValueError(
             f"{name}: row {wrong[0]} is not finite, and {len(wrong) - 1} more; wanted numbers"
