@@ -31,7 +31,7 @@ from cfr_jax.evaluation import machine
 HERE = Path(__file__).parent
 SIZES = ((717, 1), (12000, 1), (717, 32), (2048, 1), (4000, 1), (717, 8))
 RUNS = 15
-EACH = 45.0  # seconds that a line may need, mostly to compile
+EACH = 30.0  # seconds that a line may need, mostly to compile
 
 
 def main() -> None:
@@ -63,20 +63,30 @@ def main() -> None:
         args.out.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
 
     sizes = SIZES if jax.default_backend() != "cpu" else SIZES[:1] + SIZES[3:4]
-    add("roofs", roofs)
-    for points, batch in sizes:
-        add("register", lambda n=points, b=batch: register(n, b), points=points, batch=batch)
-    add("register, neighbors given", lambda: register(717, 1, given=True), points=717, batch=1)
-    add("align", align, points=1024)
-    add("same answers as the CPU", agreement, points=717)
-    for precision in ("tensorfloat32", "bfloat16", "float32"):
+
+    def registers(some):
+        for points, batch in some:
+            add("register", lambda n=points, b=batch: register(n, b), points=points, batch=batch)
+
+    def trainings(precision):
         for batch in args.training:
             add(
                 "training, drawn on the device",
-                lambda p=precision, b=batch: training(p, b, args.steps),
+                lambda b=batch: training(precision, b, args.steps),
                 precision=precision,
                 batch=batch,
             )
+
+    add("roofs", roofs)
+    registers(sizes[:1])
+    add("align", align, points=1024)
+    registers(sizes[1:3])
+    trainings("bfloat16")
+    add("same answers as the CPU", agreement, points=717)
+    registers(sizes[3:])
+    add("register, neighbors given", lambda: register(717, 1, given=True), points=717, batch=1)
+    trainings("tensorfloat32")
+    trainings("float32")
     for checkout in args.authors:
         for points, batch in sizes:
             add(
