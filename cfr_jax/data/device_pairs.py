@@ -43,7 +43,7 @@ class Shapes:
         sphere, and normals by 0.3 degrees. Raises ValueError where a coordinate is too large.
         """
         most = float(np.abs(corpus.points).max())
-        if most > np.finfo(np.float16).max:
+        if most > float(np.finfo(np.float16).max):  # the comparison would be in float16
             raise ValueError(
                 f"corpus: got a coordinate of {most:g}, wanted shapes in the unit sphere"
             )
