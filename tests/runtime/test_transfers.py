@@ -13,7 +13,8 @@ from oracle import clouds
 from cfr_jax.alignment.solving import DeviceCloud, solve_pair
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.corpus import read_corpus
-from cfr_jax.data.loader import ShapeSource, batch_at
+from cfr_jax.data.loader import batch_at
+from cfr_jax.data.sources import ShapeSource
 from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.networks.cfr.registration import Settings, encode, register
 from cfr_jax.refine import find
