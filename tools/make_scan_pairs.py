@@ -11,37 +11,14 @@ from __future__ import annotations
 
 import argparse
 import runpy
-from collections.abc import Iterator
+import tempfile
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
-from cfr_jax.data import kitti
-from cfr_jax.data.pairs import Hdf5Pairs, among
-
-
-def drives(source: dict[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Source, target and truth of each pair of frames, as they were recorded."""
-    for sequence in source["sequences"]:
-        for distance in source["distances"]:
-            scans = kitti.read_pairs(
-                source["path"], sequence, distance=distance, stride=source["stride"]
-            )
-            for row, frames in enumerate(scans.frames.tolist()):
-                if among(source["frames"], frames):
-                    clouds = (kitti.read_frame(scans.folder, sequence, f) for f in frames)
-                    yield *clouds, scans.transforms[row]
-
-
-def images(source: dict[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """The same of the pairs in a file."""
-    held = Hdf5Pairs(source["path"])
-    for row in range(len(held)):
-        if among(source["frames"], held.frames(row)):
-            pair = held[row]
-            yield pair.source, pair.target, pair.transform
+from cfr_jax.data.mixture import open_mixture
+from cfr_jax.data.scenes import SceneSource
 
 
 def main() -> None:
@@ -50,16 +27,17 @@ def main() -> None:
     parser.add_argument("--config", default="configs/scans.py")
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    sources = runpy.run_path(args.config)["get_config"]().data.validation
-    with h5py.File(args.out, "w") as file:
-        for name, source in sources.items():
-            made = {"kitti": drives, "pairs": images}[source["kind"]](source)
-            count = 0
-            for count, (first, second, truth) in enumerate(made, 1):
-                group = file.create_group(f"{name}_{count:03d}")
-                group["source"], group["target"] = np.float32(first), np.float32(second)
-                group["transform"] = truth
-            print(f"{name}: {count} pairs")
+    given = runpy.run_path(args.config)["get_config"]().data.validation
+    with tempfile.TemporaryDirectory() as cache, h5py.File(args.out, "w") as file:
+        for number, source in enumerate(open_mixture(given, Path(cache), "validation").sources):
+            assert isinstance(source, SceneSource), "scans, and no shapes"
+            for row in range(len(source)):
+                pair = source.read(row)
+                group = file.create_group(f"{number}_{row:03d}")
+                group["source"] = np.float32(pair.source)
+                group["target"] = np.float32(pair.target)
+                group["transform"] = pair.transform
+            print(f"{len(source)} {source.noun}")
 
 
 if __name__ == "__main__":
