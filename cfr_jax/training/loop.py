@@ -77,7 +77,7 @@ class _Training:
     began: float
     """When the command was given, by `time.monotonic`."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self._placed = validation.place(
             self.task.pairs, self.task.mesh, self.config.train.pairs_at_once
         )
