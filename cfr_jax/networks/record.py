@@ -26,6 +26,7 @@ class Step(NamedTuple):
     affinity: Affinity
 
 
+# Each network has a type of settings of its own, so to this table they are any.
 Unroll = Callable[[dict, Cloud, Cloud, Any], Iterable[Step]]
 """The iterations of a network: parameters, source, target and settings in, one `Step` each out."""
 

@@ -120,7 +120,7 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: RPMNetSettings)
     As published, no gradient flows through the motion between two iterations.
     """
     network = bind(params)
-form: Form = "auto" if settings.optimized else "log space"
+    form: Form = "auto" if settings.optimized else "log space"
     moved, balls = source, None
     for _ in range(settings.iterations):
         if balls is None or not settings.optimized:
@@ -130,7 +130,7 @@ form: Form = "auto" if settings.optimized else "log space"
             extract(network, cloud, ball)
             for cloud, ball in zip((moved, target), balls, strict=True)
         )
-        affinity = Affinity(of_source, of_target,  annealing.beta[0], annealing.alpha[0])
+        affinity = Affinity(of_source, of_target, annealing.beta[0], annealing.alpha[0])
         found = match(
             affinity,
             target.points,

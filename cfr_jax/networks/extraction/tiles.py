@@ -32,9 +32,9 @@ ACCELERATOR = Limits(kept=1 << 29, at_once=512)
 
 
 class Tiling(NamedTuple):
-"""`number` tiles of `size` points each; the last may be padded."""
+    """`number` tiles of `size` points each; the last may be padded."""
 
-number: int
+    number: int
     size: int
 
 
