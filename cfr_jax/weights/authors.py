@@ -34,8 +34,12 @@ def convert(path: str | Path) -> dict:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"path: there is no checkpoint at {path}")
-XX.pth": _read_torch, ".pt": _read_torch}
-    readers |= {".safetensors": load_file, ".npz": _read_npz}
+    readers: dict[str, Callable[[Path], dict[str, np.ndarray]]] = {
+        ".pth": _read_torch,
+        ".pt": _read_torch,
+        ".safetensors": lambda path: load_file(path),
+        ".npz": _read_npz,
+    }
     if path.suffix not in readers:
         raise ValueError(f"path: got a checkpoint {path.name}, wanted one of {', '.join(readers)}")
     try:
