@@ -83,7 +83,7 @@ def polish(source: DeviceCloud, target: DeviceCloud, found: Float[Array, "k 4 4"
     first, second = (surface(cloud.prepared(planning.SETTINGS)) for cloud in (source, target))
 
     def refine(motion: Array) -> tuple[Array, Array]:
-        refined = generalized_icp.refine(first, second, motion).transform
+        refined = jnp.asarray(generalized_icp.refine(first, second, motion).transform)
         return refined, quality.mutual_fit(first, second, refined, _FULL_REACH)
 
     motions, fits = lax.map(refine, found)

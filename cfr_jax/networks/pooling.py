@@ -112,7 +112,7 @@ def _of_tiles(x: Array, kernel: Array, valid: Array, *, rows: int) -> tuple[Arra
 
 def _backward(
     groups: int, rows: tuple[int, int], residuals: _Residuals, gradient: Array
-) -> tuple[Layer, Array, None]:
+) -> tuple[Layer, Array, Array]:
     layer, x, valid, (mean, covariance, channel_mean), norm, normal, chosen = residuals
     count = jnp.maximum(jnp.sum(valid), 1)
     shift = jnp.where(normal * layer.scale + layer.shift > 0, gradient, 0)

@@ -142,9 +142,8 @@ def normal_equations(
     weight = jnp.maximum(1 - jnp.sum(residual**2, axis=1) / stage.cut**2, 0) ** 2
     weight = jnp.where(source.mask, weight, 0)
     normals = rigid.rotate(transform, source.normals), partner_normals
-    metric = weight[:, None, None] * _inverse_symmetric(
-        sum(_plane(n, stage.thickness) for n in normals)
-    )
+    ours, theirs = (_plane(n, stage.thickness) for n in normals)
+    metric = weight[:, None, None] * _inverse_symmetric(ours + theirs)
     # a left twist (turn, slide) moves p by turn x p + slide
     turn = -jax.vmap(rigid.skew)(moved)
     jacobian = jnp.concatenate(

@@ -88,7 +88,8 @@ def correspondence_loss(
     """
     close = jnp.exp(squared_distance / (-2 * _SPREAD**2))
     close = jnp.where(squared_distance < _REACH**2, close, 0)
-    return 0.5 * sum(_cross_entropy(log_affinity, close, axis) for axis in (0, 1))
+    of_columns, of_rows = (_cross_entropy(log_affinity, close, axis) for axis in (0, 1))
+    return 0.5 * (of_columns + of_rows)
 
 
 def _cross_entropy(log_affinity: Array, close: Array, axis: int) -> Array:

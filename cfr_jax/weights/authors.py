@@ -9,7 +9,7 @@ whose weight (out, in) carries one or two more axes of length 1; our kernels are
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import jax

@@ -115,13 +115,14 @@ def _register(
         if count < 1:
             raise ValueError(f"{name}: got {count}, wanted at least 1")
     source = _prepared("source", source, settings)
-    if not isinstance(target, Encoded):
-        target = _encode(params, target, settings=settings)
+    reference: Encoded = (
+        target if isinstance(target, Encoded) else _encode(params, target, settings=settings)
+    )
 
     def cascade(start: Array, _: None) -> tuple[Array, dict]:
         start = lax.stop_gradient(start) if settings.detach_motion else start
         moved = moved_on(start, source, settings)
-        steps = list(iterate(params, moved, target, iterations, settings))
+        steps = list(iterate(params, moved, reference, iterations, settings))
         transforms = jnp.stack([rigid.compose(step.transform, start) for step in steps])
         found = {
             "transforms": transforms,
@@ -134,7 +135,7 @@ def _register(
         return transforms[-1], found
 
     # a loop, since it is compiled once however many there are
-    start = jnp.eye(4, dtype=jnp.result_type(source.points, target.cloud.points))
+    start = jnp.eye(4, dtype=jnp.result_type(source.points, reference.cloud.points))
     found = lax.scan(cascade, start, length=cascades)[1]
     of_all = {name: jnp.concatenate(found[name]) for name in ("transforms", "beta", "alpha")}
     of_last = {name: found[name][-1] for name in ("weights", "covered", "targets")}
@@ -145,7 +146,7 @@ def _register(
         of_last["weights"],
         of_last["covered"],
         source.mask,
-        target.cloud.mask,
+        reference.cloud.mask,
     )
     confidence = of_registration(calibration_of(params), clues)
     return Registration(**of_all, **of_last, clues=clues, confidence=confidence)

@@ -104,11 +104,12 @@ def _call(
         _whole(there),
         _whole(less[1]),
     ]
-    if others and others[0] is not None:
-        given.append(_padded(others[0], 0, size))
+    of_rows, of_columns = others or (None, None)
+    if of_rows is not None:
+        given.append(_padded(of_rows, 0, size))
         specs.append(pl.BlockSpec((size, given[-1].shape[1]), lambda i: (i, 0)))
-    if others:
-        given.append(_padded(others[1], 0 if wide else 1, size))
+    if of_columns is not None:
+        given.append(_padded(of_columns, 0 if wide else 1, size))
         specs.append(_whole(given[-1]))
     # a kernel's arrays are as wide as powers of two; sums that are not, one after the other
     widths = [here.shape[1], more] if wide else [sums]
@@ -143,15 +144,15 @@ def _whole(part: Array) -> pl.BlockSpec:
 
 def _logs(
     annealing: _Ref, here: _Ref, less_here: _Ref, there: _Ref, less_there: _Ref, tile: Array
-) -> tuple[Array, Array, pl.Slice]:
+) -> tuple[Array, Array, pl.Slice | slice]:
     """Log affinities, lessened, of this program's rows and a tile of columns; |f - g|^2; which."""
     size = less_here.shape[0]
     columns = pl.ds(tile * size, size)
-    product = sum(
+    products = (
         _dot(here[:, pl.ds(start, _CHUNK)], there[columns, pl.ds(start, _CHUNK)].T)
         for start in range(0, here.shape[1], _CHUNK)
     )
-    square = 2 - 2 * product
+    square = 2 - 2 * functools.reduce(jnp.add, products)
     logs = log_affinity(square, annealing[0], annealing[1])
     return logs - less_here[:][:, None] - less_there[columns][None], square, columns
 
