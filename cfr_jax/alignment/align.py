@@ -104,7 +104,7 @@ def steps(
         )
 
 
-def checked_params(params: Any) -> Mapping:
+def checked_params(params: Any) -> dict:
     """The weights that ship for None; raises ValueError for what are no parameters, and for a
     calibration made of other clues than `align` finds."""
     params = _default_params() if params is None else params
@@ -114,9 +114,9 @@ def checked_params(params: Any) -> Mapping:
         )
     if (fitted := calibration_of(params)) is not None:
         fitted.check("align", confidence.NAMES)
-    return params
+    return dict(params)
 
 
 @functools.cache
-def _default_params():
+def _default_params() -> dict:
     return load_params()

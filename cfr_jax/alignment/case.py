@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -52,7 +51,7 @@ class Search:
 class Case:
     """What the steps of `align` hand on to each other: each takes a case and answers a case."""
 
-    params: Mapping[str, Any]
+    params: dict[str, Any]
     plan: Plan
     found: Found | None = None
     """The answer so far, of the plan's unit clouds."""

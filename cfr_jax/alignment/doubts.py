@@ -85,7 +85,7 @@ def turns(
     return tuple(told)
 
 
-def _describe(twist):
+def _describe(twist: np.ndarray) -> str:
     turn, slide = twist[:3], twist[3:]
     verb, axis = (
         ("turn about", turn)

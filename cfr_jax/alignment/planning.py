@@ -42,13 +42,13 @@ class Plan:
 
     def started_at(self, motion: Float[np.ndarray, "4 4"]) -> Plan:
         """The same clouds, the source moved by `motion` of unit clouds first."""
-        points = np.float32(motions.apply(motion, self.source.points))
+        points = motions.apply(motion, self.source.points).astype(np.float32)
         points *= self.source.mask[:, None]
         normals = self.source.normals
         moved = dataclasses.replace(
             self.source,
             points=points,
-            normals=None if normals is None else np.float32(motions.rotate(motion, normals)),
+            normals=None if normals is None else motions.rotate(motion, normals).astype(np.float32),
         )
         frames = dataclasses.replace(
             self.frames,
@@ -97,7 +97,7 @@ def planned(
         several = starts.everywhere()
     elif given is not None and start is None:
         several = starts.given(frames, given)
-    made = (
+    unit_source, unit_target = (
         to_unit(
             cloud,
             center,
@@ -115,7 +115,8 @@ def planned(
     )
     return Plan(
         frames,
-        *made,
+        unit_source,
+        unit_target,
         seed,
         start_given=start is not None,
         starts=several,

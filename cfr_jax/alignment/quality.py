@@ -136,7 +136,7 @@ def mutual_fit(
     or when a thin shape is turned over.
     """
 
-    def covered(first, second, motion):
+    def covered(first: Surface, second: Surface, motion: Array) -> Array:
         found = closest(rigid.apply(motion, first.points), second.points, second.mask)
         normals = rigid.rotate(motion, first.normals)
         cosine = jnp.sum(normals * second.normals[found.index], axis=1)
@@ -148,7 +148,7 @@ def mutual_fit(
     return (there + covered(target, source, rigid.invert(transform))) / 2
 
 
-def _truncated(source, target, transforms, distance):
+def _truncated(source: Surface, target: Surface, transforms: Array, distance: float) -> Array:
     """Mean over the source of the squared distance to the target, truncated, under each of the
     `transforms`; in [0, 1]."""
     square = squared_distances(source, target, transforms)
@@ -157,7 +157,7 @@ def _truncated(source, target, transforms, distance):
     return jnp.sum(truncated * valid, axis=1) / jnp.maximum(jnp.sum(valid), 1)
 
 
-def _pointwise_information(points, weights):
+def _pointwise_information(points: Array, weights: Array) -> Array:
     """Sum of J'J, J how a twist (turn, slide) moves a point: turn x p + slide."""
     turn = -jax.vmap(rigid.skew)(points)
     slide = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), turn.shape)

@@ -68,7 +68,7 @@ def propose(
     encoded = encode(params, sides[1], settings=COARSE)
     surfaces = surface(sides[0]), surface(sides[1])
 
-    def end(start):
+    def end(start: Array) -> tuple[Array, Array]:
         found = register(params, moved_by(start, sides[0]), encoded, settings=COARSE)
         motion = rigid.compose(found.transform, start)
         return motion, quality.mutual_fit(*surfaces, motion, _COARSE_REACH)
@@ -80,13 +80,14 @@ def propose(
 @jax.jit
 def polish(source: DeviceCloud, target: DeviceCloud, found: Float[Array, "k 4 4"]) -> Candidates:
     """Refines each motion on the full clouds, and puts what fits best first."""
-    surfaces = [surface(cloud.prepared(planning.SETTINGS)) for cloud in (source, target)]
+    first, second = (surface(cloud.prepared(planning.SETTINGS)) for cloud in (source, target))
 
-    def refine(motion):
-        refined = generalized_icp.refine(*surfaces, motion).transform
-        return refined, quality.mutual_fit(*surfaces, refined, _FULL_REACH)
+    def refine(motion: Array) -> tuple[Array, Array]:
+        refined = jnp.asarray(generalized_icp.refine(first, second, motion).transform)
+        return refined, quality.mutual_fit(first, second, refined, _FULL_REACH)
 
-    return _distinct(*lax.map(refine, found), len(found))
+    motions, fits = lax.map(refine, found)
+    return _distinct(motions, fits, len(found))
 
 
 def search(case: Case) -> Case:
@@ -141,10 +142,10 @@ def same(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Array:
     return (rigid.rotation_error(first, second) < _SAME_TURN) & (away < _SAME_PLACE)
 
 
-def _distinct(motions, fits, kept):
+def _distinct(motions: Array, fits: Array, kept: int) -> Candidates:
     """The best fit, then the best of those that differ from it, and so on."""
 
-    def take(fits, _):
+    def take(fits: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
         best = jnp.argmax(fits)
         near = jax.vmap(functools.partial(same, motions[best]))(motions)
         return jnp.where(near, -1, fits), (motions[best], fits[best])

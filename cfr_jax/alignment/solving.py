@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -60,7 +60,7 @@ programs.storable(
 programs.storable_static(Calibration, Calibration.write, Calibration.read)
 
 
-def solve(params: Mapping, source: Cloud, target: Encoded, *, refine: Refinement | None) -> Found:
+def solve(params: dict, source: Cloud, target: Encoded, *, refine: Refinement | None) -> Found:
     """The device's part for one pair of unit clouds: registered, refined, judged.
 
     Refining never answers worse, by its own score, than the network did or than the source lay
@@ -77,8 +77,8 @@ def solve(params: Mapping, source: Cloud, target: Encoded, *, refine: Refinement
         kept, moved = scores(*surfaces, jnp.stack([start, refined.transform]), DISTANCE)
         stays = kept < moved
         transform = jnp.where(stays, start, refined.transform)
-        improved, steps = refined.improved | stays, refined.steps
-        converged = refined.converged
+        improved, steps = refined.improved | stays, jnp.asarray(refined.steps)
+        converged = jnp.asarray(refined.converged)
     measured, clues = _judge(registration, transform, target.cloud, surfaces)
     return Found(registration, transform, improved, converged, steps, measured, clues)
 
@@ -102,7 +102,9 @@ def replaced(
     return Found(found.registration, transform, improved, converged, steps, measured, clues)
 
 
-def _judge(registration, transform, target, surfaces):
+def _judge(
+    registration: Registration, transform: Array, target: Cloud, surfaces: tuple[Surface, Surface]
+) -> tuple[quality.Quality, confidence.Clues]:
     spacing = quality.spacing(target.points, target.neighbors, surfaces[1].mask)
     measured = quality.measure(*surfaces, transform, DISTANCE, spacing)
     return measured, confidence.gather(
@@ -125,7 +127,7 @@ def on_device(unit: UnitCloud) -> DeviceCloud:
 
 @functools.partial(jax.jit, static_argnames=("refine",))
 def solve_pair(
-    params: Mapping, source: DeviceCloud, target: DeviceCloud, *, refine: Refinement | None
+    params: dict, source: DeviceCloud, target: DeviceCloud, *, refine: Refinement | None
 ) -> Found:
     """`solve` for two clouds as `on_device` hands them over."""
     encoded = encode(params, target.prepared(), settings=SETTINGS)

@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cfr_jax.cli.shared import outputs
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _DESCRIPTION = """\
 Registers two views of an object, as a depth camera would see it from two places, that ship with
@@ -71,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def errors_in_words(estimate, truth, points) -> dict[str, str]:
+def errors_in_words(estimate: np.ndarray, truth: np.ndarray, points: np.ndarray) -> dict[str, str]:
     """How far (4, 4) `estimate` is from (4, 4) `truth` for (n, 3) `points` of the source."""
     import numpy as np
 

@@ -29,7 +29,7 @@ class MethodEntry:
     estimated_normals: bool = False  # even where the pairs have exact ones
     modules: bool = False  # whether to time the parts of a network, too
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_types(self, "methods: ")
         if self.batch < 1:
             raise ValueError(f"methods: batch: got {self.batch}, wanted at least 1 pair")
@@ -57,7 +57,7 @@ class EvaluationConfig:
     main_threshold: Threshold = (5.0, 0.1)  # of the plots
     limits: Threshold = (15.0, 0.3)  # where the axes of the recall plots end
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_types(self)
         for name, entry in self.methods.items():
             if not isinstance(entry, MethodEntry):

@@ -171,12 +171,14 @@ class Metric:
 
 def _to_truth(function: Callable[[Motions, Motions], Errors]) -> Callable[[Motions, Pair], Errors]:
     def of(estimates: Motions, pair: Pair) -> Errors:
+        assert pair.transform is not None  # a metric of the truth is for pairs that have one
         return function(estimates, np.broadcast_to(pair.transform, estimates.shape))
 
     return of
 
 
 def _chamfer_of(estimates: Motions, pair: Pair) -> Errors:
+    assert pair.clean_source is not None and pair.clean_target is not None
     clouds = pair.source, pair.target, pair.clean_source, pair.clean_target
     return np.array([chamfer(estimate, *clouds) for estimate in estimates])
 

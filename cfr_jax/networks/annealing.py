@@ -77,7 +77,9 @@ class AnnealingNet(nn.Module):
         return Annealing(beta=x[: self.iterations], alpha=x[self.iterations :])
 
 
-def _join_masks(source, target, source_mask, target_mask):
+def _join_masks(
+    source: Array, target: Array, source_mask: Array | None, target_mask: Array | None
+) -> Array | None:
     if source_mask is None and target_mask is None:
         return None
     masks = [

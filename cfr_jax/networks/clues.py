@@ -79,21 +79,21 @@ def of_registration(fitted: Calibration | None, clues: NetworkClues) -> Float[Ar
     return 1 / (1 + jnp.exp(-jnp.clip(sure, -SURE, SURE)))
 
 
-def _mean(values, mask):
+def _mean(values: Array, mask: Array | None) -> Array:
     if mask is None:
         return jnp.mean(values)
     valid = mask.astype(values.dtype)
     return jnp.sum(values * valid) / jnp.maximum(jnp.sum(valid), 1)
 
 
-def turned(first, second):
+def turned(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Float[Array, ""]:
     """Log of degrees + 0.1; its slope is bounded where motions are equal or half a turn apart."""
     chord = jnp.sum((first[:3, :3] - second[:3, :3]) ** 2)
     half_sine = jnp.minimum(jnp.sqrt(chord / 8 + 1e-12), 1 - 1e-6)
     return jnp.log(jnp.rad2deg(2 * jnp.arcsin(half_sine)) + 0.1)
 
 
-def _spread(points, share):
+def _spread(points: Array, share: Array) -> Array:
     """Covariance of weighted points."""
     center = jnp.matmul(share, points, precision=_HIGHEST)
     offset = points - center

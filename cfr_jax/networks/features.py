@@ -73,12 +73,12 @@ def safe_norm(vectors: Float[Array, "*rows c"]) -> Float[Array, "*rows"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
 
 
-def _dot(a, b):
+def _dot(a: Array, b: Array) -> Array:
     # written out: a matrix product would run at reduced precision on accelerators
     return jnp.sum(a * b, axis=-1)
 
 
-def _angle(a, b):
+def _angle(a: Array, b: Array) -> Array:
     sine, cosine = safe_norm(jnp.cross(a, b)), _dot(a, b)
     nowhere = (sine == 0) & (cosine == 0)
     return jnp.where(nowhere, 0, jnp.arctan2(sine, jnp.where(nowhere, 1, cosine)))

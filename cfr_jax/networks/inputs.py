@@ -7,6 +7,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
@@ -98,7 +99,7 @@ def moved_by(motion: Float[Array, "4 4"], cloud: Cloud) -> Cloud:
     return Cloud(points, normals, cloud.neighbors, cloud.mask)
 
 
-def check_points(name: str, points: Array) -> None:
+def check_points(name: str, points: Array | np.ndarray) -> None:
     """Raises ValueError, naming the argument, where its shape is not that of a cloud."""
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise ValueError(

@@ -49,10 +49,10 @@ def group_norm(
     # wide as x instead of as narrow as a group
     size = x.shape[1] // groups
     valid = None if mask is None else mask[:, None].astype(x.dtype)
-    count = jnp.asarray(x.shape[0], x.dtype) if mask is None else jnp.maximum(jnp.sum(valid), 1)
+    count = jnp.asarray(x.shape[0], x.dtype) if valid is None else jnp.maximum(jnp.sum(valid), 1)
 
-    def mean_of_group(rows):
-        total = jnp.sum(rows if mask is None else rows * valid, axis=0)
+    def mean_of_group(rows: Array) -> Array:
+        total = jnp.sum(rows if valid is None else rows * valid, axis=0)
         return jnp.repeat(total.reshape(groups, size).mean(1) / count, size)
 
     centered = x - mean_of_group(x)
@@ -115,7 +115,7 @@ class _Linear(nn.Module):
     width: int
 
     @nn.compact
-    def __call__(self, inputs: int):
+    def __call__(self, inputs: int) -> tuple[Array, Array]:
         kernel = self.param("kernel", kernel_init, (inputs, self.width))
         return kernel, self.param("bias", nn.initializers.zeros, (self.width,))
 

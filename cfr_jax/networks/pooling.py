@@ -16,11 +16,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from cfr_jax.networks.layers import Layer, norm_of, projections
+from cfr_jax.networks.layers import Layer, Norm, norm_of, projections
 
 _HIGHEST = lax.Precision.HIGHEST  # for what becomes a variance
 # 64 MiB of 1,024 channels: clouds of the usual size are one tile. An accelerator takes more.
 _ON_CPU, _ELSEWHERE = 1 << 14, 1 << 18
+
+_Residuals = tuple[Layer, Array, Array, tuple[Array, Array, Array], Norm, Array, Array]
 
 
 def pooled_layer(
@@ -41,11 +43,13 @@ def pooled_layer(
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
-def _pooled(layer, x, valid, groups, rows):
+def _pooled(layer: Layer, x: Array, valid: Array, groups: int, rows: tuple[int, int]) -> Array:
     return _forward(layer, x, valid, groups, rows)[0]
 
 
-def _forward(layer, x, valid, groups, rows):
+def _forward(
+    layer: Layer, x: Array, valid: Array, groups: int, rows: tuple[int, int]
+) -> tuple[Array, _Residuals]:
     count = jnp.maximum(jnp.sum(valid), 1)
     mean = valid @ x / count
     centered = (x - mean) * valid[:, None]
@@ -60,7 +64,7 @@ def _forward(layer, x, valid, groups, rows):
     return pooled, (layer, x, valid, (mean, covariance, channel_mean), norm, normal, chosen)
 
 
-def _highest(x, kernel, valid, rows):
+def _highest(x: Array, kernel: Array, valid: Array, rows: tuple[int, int]) -> tuple[Array, Array]:
     """Per channel the largest value of x kernel over the valid rows, and the first row that has it;
     0 and some row where none is valid."""
     n = x.shape[0]
@@ -72,7 +76,9 @@ def _highest(x, kernel, valid, rows):
     return jnp.where(jnp.isfinite(high), high, 0), jnp.minimum(chosen, n - 1)
 
 
-def _of_tile(x, kernel, valid, start, last):
+def _of_tile(
+    x: Array, kernel: Array, valid: Array, start: Array | int, last: int
+) -> tuple[Array, Array]:
     z = jnp.where(valid[:, None] > 0, x @ kernel, -jnp.inf)
     high = jnp.max(z, axis=0)
     # two plain reductions: XLA's argmax on CPU is not vectorized
@@ -80,12 +86,14 @@ def _of_tile(x, kernel, valid, start, last):
     return high, jnp.min(jnp.where(z >= high, rows, last), axis=0)
 
 
-def _of_tiles(x, kernel, valid, *, rows):
+def _of_tiles(x: Array, kernel: Array, valid: Array, *, rows: int) -> tuple[Array, Array]:
     n = x.shape[0]
     if n <= rows:
         return _of_tile(x, kernel, valid, 0, n - 1)
 
-    def merge(best, tile):
+    def merge(
+        best: tuple[Array, Array], tile: tuple[Array, Array, Array]
+    ) -> tuple[tuple[Array, Array], None]:
         x, valid, start = tile
         high, chosen = _of_tile(x, kernel, valid, start, n - 1)
         higher = high > best[0]
@@ -102,7 +110,9 @@ def _of_tiles(x, kernel, valid, *, rows):
     return lax.scan(merge, lowest, tiles)[0]
 
 
-def _backward(groups, rows, residuals, gradient):
+def _backward(
+    groups: int, rows: tuple[int, int], residuals: _Residuals, gradient: Array
+) -> tuple[Layer, Array, Array]:
     layer, x, valid, (mean, covariance, channel_mean), norm, normal, chosen = residuals
     count = jnp.maximum(jnp.sum(valid), 1)
     shift = jnp.where(normal * layer.scale + layer.shift > 0, gradient, 0)

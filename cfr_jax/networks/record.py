@@ -8,7 +8,7 @@ and compared by what the record says.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float
@@ -26,7 +26,8 @@ class Step(NamedTuple):
     affinity: Affinity
 
 
-Unroll = Callable[[dict, Cloud, Cloud, Hashable], Iterable[Step]]
+# Each network has a type of settings of its own, so to this table they are any.
+Unroll = Callable[[dict, Cloud, Cloud, Any], Iterable[Step]]
 """The iterations of a network: parameters, source, target and settings in, one `Step` each out."""
 
 

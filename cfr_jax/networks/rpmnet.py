@@ -34,7 +34,7 @@ from cfr_jax.networks.parts import (
     move,
 )
 from cfr_jax.networks.record import Checkpoint, Network, Part, Place, Step, places_of
-from cfr_jax.networks.sinkhorn import Affinity, match
+from cfr_jax.networks.sinkhorn import Affinity, Form, match
 
 _WIDTHS = (96, 96, 192)
 _CHANNELS = 96
@@ -99,11 +99,11 @@ class Features(nn.Module):
 class RPMNet(nn.Module):
     """The two learned parts, shared by all iterations."""
 
-    def setup(self):
+    def setup(self) -> None:
         self.features = Features()
         self.annealing = AnnealingNet(iterations=1)
 
-    def __call__(self, raw, source, target):
+    def __call__(self, raw: Array, source: Array, target: Array) -> object:
         """Touches every part once, so that `init` makes all parameters."""
         return self.features(raw), self.annealing(source, target)
 
@@ -120,17 +120,17 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: RPMNetSettings)
     As published, no gradient flows through the motion between two iterations.
     """
     network = bind(params)
-    form = "auto" if settings.optimized else "log space"
+    form: Form = "auto" if settings.optimized else "log space"
     moved, balls = source, None
     for _ in range(settings.iterations):
         if balls is None or not settings.optimized:
             balls = [find_neighbors(cloud, settings) for cloud in (moved, target)]
         annealing = network.annealing(moved.points, target.points, source.mask, target.mask)
-        features = [
+        of_source, of_target = (
             extract(network, cloud, ball)
             for cloud, ball in zip((moved, target), balls, strict=True)
-        ]
-        affinity = Affinity(*features, annealing.beta[0], annealing.alpha[0])
+        )
+        affinity = Affinity(of_source, of_target, annealing.beta[0], annealing.alpha[0])
         found = match(
             affinity,
             target.points,

@@ -71,7 +71,7 @@ def descend(
     moves.
     """
 
-    def run(transform, stage):
+    def run(transform: Array, stage: Stage) -> tuple[Array, tuple[Array, Array]]:
         transform, steps, settled = _run_stage(source, target, transform, stage)
         return transform, (steps, settled)
 
@@ -104,12 +104,14 @@ def squared_distances(
     return found.square.reshape(moved.shape[:2])
 
 
-def _run_stage(source, target, transform, stage):
-    def unsettled(state):
+def _run_stage(
+    source: Surface, target: Surface, transform: Array, stage: Stage
+) -> tuple[Array, Array, Array]:
+    def unsettled(state: tuple[Array, Array, Array]) -> Array:
         _, step, size = state
         return (step < _STEPS_PER_CUT) & (size > _SETTLED)
 
-    def step(state):
+    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         transform, count, _ = state
         twist = _gauss_newton(source, target, transform, stage)
         return rigid.compose(rigid.exp(twist), transform), count + 1, jnp.max(jnp.abs(twist))
@@ -119,7 +121,7 @@ def _run_stage(source, target, transform, stage):
     return transform, steps, size <= _SETTLED
 
 
-def _gauss_newton(source, target, transform, stage):
+def _gauss_newton(source: Surface, target: Surface, transform: Array, stage: Stage) -> Array:
     """The twist that lessens sum_i w_i r_i' M_i r_i the most, r = T x - y, linearized."""
     found = closest(rigid.apply(transform, source.points), target.points, target.mask)
     partners = target.points[found.index], target.normals[found.index]
@@ -140,9 +142,8 @@ def normal_equations(
     weight = jnp.maximum(1 - jnp.sum(residual**2, axis=1) / stage.cut**2, 0) ** 2
     weight = jnp.where(source.mask, weight, 0)
     normals = rigid.rotate(transform, source.normals), partner_normals
-    metric = weight[:, None, None] * _inverse_symmetric(
-        sum(_plane(n, stage.thickness) for n in normals)
-    )
+    ours, theirs = (_plane(n, stage.thickness) for n in normals)
+    metric = weight[:, None, None] * _inverse_symmetric(ours + theirs)
     # a left twist (turn, slide) moves p by turn x p + slide
     turn = -jax.vmap(rigid.skew)(moved)
     jacobian = jnp.concatenate(
@@ -160,13 +161,13 @@ def solve(system: Float[Array, "6 6"], pull: Float[Array, " 6"]) -> Float[Array,
     return -solve_positive(system + damping * jnp.eye(6, dtype=system.dtype), pull)
 
 
-def _plane(normals, thickness):
+def _plane(normals: Array, thickness: Array | float) -> Array:
     """Covariance of a small plane: thin along the normal, one across; round where there is none."""
     outer = normals[:, :, None] * normals[:, None, :]
     return jnp.eye(3, dtype=normals.dtype) - (1 - thickness) * outer
 
 
-def _inverse_symmetric(m):
+def _inverse_symmetric(m: Array) -> Array:
     """Inverses of (n, 3, 3) symmetric matrices by cofactors; ours are far from singular."""
     a, b, c = m[:, 0, 0], m[:, 0, 1], m[:, 0, 2]
     d, e, f = m[:, 1, 1], m[:, 1, 2], m[:, 2, 2]

@@ -76,11 +76,11 @@ def refine(source: HostSurface, target: HostSurface, initial: Float[np.ndarray, 
     return Fit(transform, improved, settled, steps, *_measure(*level, transform))
 
 
-def _level(surface, budget):
-    def make():
+def _level(surface: HostSurface, budget: int) -> Level:
+    def make() -> Level:
         rows = subsample(surface.points, budget, seed=0)
         points, normals = surface.points[rows].astype(np.float32), surface.normals
-        normals = _normals(points) if normals is None else np.float32(normals[rows])
+        normals = _normals(points) if normals is None else normals[rows].astype(np.float32)
         return Level(points, normals)
 
     return surface.once(("pyramid", min(budget, len(surface.points))), make)
@@ -89,27 +89,31 @@ def _level(surface, budget):
 _estimate = jax.jit(estimate_normals)
 
 
-def _normals(points):
+def _normals(points: np.ndarray) -> np.ndarray:
     k = min(_NEIGHBORS, len(points) - 1)
     pad = ((0, bucket(len(points)) - len(points)), (0, 0))
     near = np.pad(nearest_on_host(points, k, workers=-1), pad)
     return np.asarray(_estimate(np.pad(points, pad), near))[: len(points)]
 
 
-def _pairs(source, target, transform, cut):
+def _pairs(
+    source: Level, target: Level, transform: np.ndarray, cut: float
+) -> tuple[np.ndarray, np.ndarray]:
     """The closest target point of each source point, and its distance; infinite beyond the cut."""
     moved = motions.apply(transform, source.points)
     return target.tree.query(moved, distance_upper_bound=cut, workers=-1)
 
 
-def _cut(source, target, transform, cut):
+def _cut(source: Level, target: Level, transform: np.ndarray, cut: float) -> float:
     distance, _ = _pairs(source, target, transform, cut)
     near = distance[np.isfinite(distance)]
     return min(cut, max(_LEAST_CUT, _SPREADS * float(np.median(near)))) if len(near) else cut
 
 
-def _descend(source, target, transform, cut):
-    stage = Stage(*np.float32([cut, _THICKNESS]))
+def _descend(
+    source: Level, target: Level, transform: np.ndarray, cut: float
+) -> tuple[np.ndarray, int, bool]:
+    stage = Stage(*np.array([cut, _THICKNESS], np.float32))
     for step in range(_MOST_STEPS):
         _, index = _pairs(source, target, transform, stage.cut)
         partners = np.minimum(index, len(target.points) - 1)
@@ -120,7 +124,9 @@ def _descend(source, target, transform, cut):
     return transform, _MOST_STEPS, False
 
 
-def _twist(source, target, index, transform, stage):
+def _twist(
+    source: Level, target: Level, index: np.ndarray, transform: np.ndarray, stage: Stage
+) -> np.ndarray:
     """One Gauss-Newton step as a motion, its equations summed in float64."""
     moving = jnp.asarray(transform, jnp.float32)
     system, pull = np.zeros((6, 6)), np.zeros(6)
@@ -155,13 +161,13 @@ def _equations(
     return generalized_icp.normal_equations(surface, partners, partner_normals, transform, stage)
 
 
-def _score(source, target, transform, cut):
+def _score(source: Level, target: Level, transform: np.ndarray, cut: float) -> float:
     """`generalized_icp.scores` of one motion, by the tree."""
     distance, _ = _pairs(source, target, transform, cut)
     return float(np.mean(1 - (1 - np.minimum(distance / cut, 1) ** 2) ** 3))
 
 
-def _measure(source, target, transform):
+def _measure(source: Level, target: Level, transform: np.ndarray) -> tuple[float, float]:
     """Fitness and inlier error."""
     distance, _ = _pairs(source, target, transform, CUT)
     near = distance[np.isfinite(distance)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,9 @@ def refine(
     """
     small_gicp = require("small_gicp")
     (moving, _), (cloud, tree) = (
-        surface.once(("small_gicp", neighbors), lambda s=surface: _prepared(s.points, neighbors))
+        surface.once(
+            ("small_gicp", neighbors), functools.partial(_prepared, surface.points, neighbors)
+        )
         for surface in (source, target)
     )
     motion, converged, steps = initial, False, 0

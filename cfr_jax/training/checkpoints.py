@@ -19,7 +19,7 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +57,7 @@ class Checkpoints:
     def __enter__(self) -> Checkpoints:
         return self
 
-    def __exit__(self, kind, *_) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             if kind is None:
                 self.wait()
@@ -126,7 +126,7 @@ class Checkpoints:
             ) from error
         return state, json.loads((folder / "about.json").read_text("utf-8"))
 
-    def _newest_sound(self):
+    def _newest_sound(self) -> int:
         for step in reversed(self.steps()):
             folder = self.folder / str(step)
             try:
@@ -145,7 +145,7 @@ class Checkpoints:
             )
         return -1
 
-    def _finish(self, step, beside, about, best):
+    def _finish(self, step: int, beside: Path, about: dict[str, Any], best: int | None) -> None:
         try:
             self._writer.wait_until_finished()
             if not is_first():
@@ -162,7 +162,7 @@ class Checkpoints:
             if old != best:
                 shutil.rmtree(self.folder / str(old))
 
-    def _fail(self, step: int, error: Any):
+    def _fail(self, step: int, error: Any) -> NoReturn:
         if is_first():
             shutil.rmtree(self.folder / _UNFINISHED, ignore_errors=True)
         left = self.steps()[-1:]

@@ -30,7 +30,7 @@ class DataSection:
     train: object = "data/open_cad/train.h5"  # `cfr data open-cad --out data/open_cad` makes it
     validation: object = "data/open_cad/val.h5"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for each in dataclasses.fields(self):
             given = getattr(self, each.name)
             if not isinstance(given, str | dict):
@@ -60,7 +60,7 @@ class SamplingSection:
     sensor_scale: Range = Sampling.sensor_scale  # standard deviation at the middle of the cloud
     estimated_normals: float = 0.4  # of the pairs; users' clouds mostly have no exact ones
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_types(self, "sampling.")
 
 
@@ -75,7 +75,7 @@ class Phase:
     sampling: dict[str, Any] = field(default_factory=dict)
     """Fields of `SamplingSection` that differ in this phase."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_types(self, "phases: ")
         if self.steps < 0 or self.batch < 1:
             raise ValueError(
@@ -113,7 +113,7 @@ class TrainSection:
     minutes: float = 0.0  # of the wall clock, instead of the only phase's steps; 0: those steps
     start_from: str = ""  # weights to go on from, by name or path, instead of random ones
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_types(self, "train.")
         _check_least(self, 1, "workers", "steps_at_once")
         _check_least(self, 0, "max_skipped", "minutes")
@@ -152,7 +152,7 @@ class TrainingConfig:
     validation_pairs: int = 465
     keep_checkpoints: int = 2  # the last ones; the best is kept beside them
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         # made once more, sections are checked with what flags have set since
         self.data = _made(DataSection, self.data, "data")
         self.sampling = _made(SamplingSection, self.sampling, "sampling")

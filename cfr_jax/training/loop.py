@@ -77,7 +77,7 @@ class _Training:
     began: float
     """When the command was given, by `time.monotonic`."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self._placed = validation.place(
             self.task.pairs, self.task.mesh, self.config.train.pairs_at_once
         )
@@ -117,7 +117,7 @@ class _Training:
             self.reports.step(done, measured, steps)
             last, asked = done == task.steps, requests.received
 
-            def due(every, before=before, done=done, last=last):
+            def due(every: int, before: int = before, done: int = done, last: bool = last) -> bool:
                 return last or before // every < done // every
 
             logging, validating = due(config.log_every), due(config.validate_every)

@@ -71,7 +71,7 @@ def pair_loss(
     )
 
 
-def _pose_term(step: Step, points, there):
+def _pose_term(step: Step, points: Array, there: Array) -> Array:
     distance = jnp.mean(jnp.abs(rigid.apply(step.transform, points) - there))
     slack = jnp.mean(1 - step.match.covered) + jnp.mean(1 - step.match.weights)
     return distance + _INLIER_WEIGHT * slack
@@ -88,10 +88,11 @@ def correspondence_loss(
     """
     close = jnp.exp(squared_distance / (-2 * _SPREAD**2))
     close = jnp.where(squared_distance < _REACH**2, close, 0)
-    return 0.5 * sum(_cross_entropy(log_affinity, close, axis) for axis in (0, 1))
+    of_columns, of_rows = (_cross_entropy(log_affinity, close, axis) for axis in (0, 1))
+    return 0.5 * (of_columns + of_rows)
 
 
-def _cross_entropy(log_affinity, close, axis):
+def _cross_entropy(log_affinity: Array, close: Array, axis: int) -> Array:
     found = jnp.max(close, axis=axis)
     share = found / jnp.maximum(jnp.sum(close, axis=axis), 1e-12)
     # the slack's logit is 0
@@ -101,5 +102,6 @@ def _cross_entropy(log_affinity, close, axis):
     return jnp.mean(log_normalizer - share * jnp.sum(close * log_affinity, axis=axis))
 
 
-def _squared_distances(a, b):
-    return sum((a[:, axis, None] - b[None, :, axis]) ** 2 for axis in range(3))
+def _squared_distances(a: Array, b: Array) -> Array:
+    x, y, z = ((a[:, axis, None] - b[None, :, axis]) ** 2 for axis in range(3))
+    return x + y + z

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 import optax.contrib
 from jax.typing import ArrayLike
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, PyTree
 
 SCHEDULES = ("cosine", "wsd", "constant", "trapezoid")
 OPTIMIZERS = ("adamw", "adam", "lion", "sgd", "muon")
@@ -49,7 +49,8 @@ class Trapezoid:
 class Planned(NamedTuple):
     """Where in a training of how many steps an optimizer is."""
 
-    count: Int[Array, ""]
+    # optax finds the step by this name, which hides a method of tuples
+    count: Int[Array, ""]  # type: ignore[assignment]
     planned_steps: Int[Array, ""]
 
 
@@ -136,15 +137,15 @@ def make_optimizer(
     return optax.chain(optax.clip_by_global_norm(clip), rule)
 
 
-def _one(count):
+def _one(count: ArrayLike) -> Array:
     return jnp.ones((), jnp.float32)
 
 
 def _scaled_by(schedule: Trapezoid) -> optax.GradientTransformation:
-    def init(params):
+    def init(params: PyTree) -> Planned:
         return Planned(jnp.zeros((), jnp.int32), jnp.asarray(schedule.steps, jnp.int32))
 
-    def update(updates, state, params=None):
+    def update(updates: PyTree, state: Planned, params: PyTree = None) -> tuple[PyTree, Planned]:
         rate = schedule.at(state.count, state.planned_steps)
         updates = jax.tree.map(lambda leaf: rate * leaf, updates)
         return updates, Planned(state.count + 1, state.planned_steps)
@@ -152,10 +153,10 @@ def _scaled_by(schedule: Trapezoid) -> optax.GradientTransformation:
     return optax.GradientTransformation(init, update)
 
 
-def _hidden_matrices(params):
+def _hidden_matrices(params: PyTree) -> PyTree:
     """Which axes of a leaf are a hidden matrix's inputs and outputs, or None."""
 
-    def axes(leaf):
+    def axes(leaf: Array) -> optax.contrib.MuonDimensionNumbers | None:
         if leaf.ndim < 2 or min(leaf.shape[-2:]) not in _HIDDEN:
             return None
         return optax.contrib.MuonDimensionNumbers(leaf.ndim - 2, leaf.ndim - 1)

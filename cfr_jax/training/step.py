@@ -12,7 +12,7 @@ import optax
 from flax import struct
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Int, Int32, UInt32
+from jaxtyping import Array, Int, Int32, PyTree, UInt32
 
 from cfr_jax.data.augment import Sampling
 from cfr_jax.data.device_pairs import Shapes, draw_pairs
@@ -101,10 +101,10 @@ def train_on_drawn(
     """`k` steps in one go, each on pairs that the devices draw (`data.device_pairs`): shape
     `items[i]` at place `positions[i]` of the stream. Losses of all k b pairs."""
 
-    def draw(shapes, seed, items, positions):
+    def draw(shapes: Shapes, seed: Array, items: Array, positions: Array) -> dict[str, Array]:
         return draw_pairs(shapes, seed, items, positions, sampling)
 
-    def one(state, stretch):
+    def one(state: TrainState, stretch: tuple[Array, Array]) -> tuple[TrainState, PairLoss]:
         # each device draws its own share
         batch = jax.shard_map(
             draw,
@@ -119,7 +119,9 @@ def train_on_drawn(
     return state, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), measured)
 
 
-def _advance(state, batch, recipe):
+def _advance(
+    state: TrainState, batch: dict[str, Array], recipe: Recipe
+) -> tuple[TrainState, PairLoss]:
     with jax.default_matmul_precision(_PRODUCTS[recipe.precision]):
         gradient, measured = jax.shard_map(
             functools.partial(_mean_gradient, recipe=recipe),
@@ -137,7 +139,7 @@ def _advance(state, batch, recipe):
     decay = jnp.minimum(recipe.average_decay, (1 + state.step) / (10 + state.step))
     average = jax.tree.map(lambda a, p: a + (1 - decay) * (p - a), state.average, params)
 
-    def keep(new, old):
+    def keep(new: PyTree, old: PyTree) -> PyTree:
         return jax.tree.map(lambda n, o: jnp.where(sound, n, o), new, old)
 
     after = TrainState(
@@ -151,10 +153,12 @@ def _advance(state, batch, recipe):
     return after, measured
 
 
-def _mean_gradient(params, batch, *, recipe):
+def _mean_gradient(
+    params: dict, batch: dict[str, Array], *, recipe: Recipe
+) -> tuple[dict, PairLoss]:
     """The gradient of the mean loss over all devices, from this device's pairs of the batch."""
 
-    def loss(params, pair):
+    def loss(params: dict, pair: dict[str, Array]) -> tuple[Array, PairLoss]:
         source, target = (_cloud(pair, side) for side in ("source", "target"))
         measured = pair_loss(
             recipe.unroll(params, source, target, recipe.settings),
@@ -169,7 +173,7 @@ def _mean_gradient(params, batch, *, recipe):
     size = len(batch["transform"])
     at_once = min(recipe.pairs_at_once, size)
 
-    def add(total, pairs):
+    def add(total: dict, pairs: dict[str, Array]) -> tuple[dict, PairLoss]:
         if at_once == 1:  # a batch axis of one would send XLA's products down a slower path
             gradient, measured = gradient_of(params, jax.tree.map(lambda leaf: leaf[0], pairs))
             measured = jax.tree.map(lambda leaf: leaf[None], measured)
@@ -189,7 +193,7 @@ def _mean_gradient(params, batch, *, recipe):
     return jax.tree.map(lambda leaf: leaf / count, total), measured
 
 
-def _cloud(pair, side):
+def _cloud(pair: dict[str, Array], side: str) -> Cloud:
     points, neighbors = pair[side], pair[f"{side}_neighbors"]
     normals = jnp.where(
         pair["estimate_normals"], estimate_normals(points, neighbors), pair[f"{side}_normals"]
@@ -210,11 +214,11 @@ def predict(
     """Transforms (b, L, 4, 4) of a batch that needs no training; each device takes its share,
     `pairs_at_once` pairs vectorized and the rest one after the other, all in float32."""
 
-    def of_pair(params, pair):
+    def of_pair(params: dict, pair: dict[str, Array]) -> Array:
         source, target = (_cloud(pair, side) for side in ("source", "target"))
         return jnp.stack([step.transform for step in unroll(params, source, target, settings)])
 
-    def of_share(params, pairs):
+    def of_share(params: dict, pairs: dict[str, Array]) -> Array:
         size = len(pairs["transform"])
         return jax.lax.map(
             functools.partial(of_pair, params),

@@ -36,7 +36,8 @@ def stop_requests() -> Iterator[Requests]:
     Of several processes none may stop alone while the others wait for it, so there, and outside a
     program's main thread, signals act as ever from the first one on.
     """
-    requests, usual = Requests(), {}
+    requests = Requests()
+    usual: dict[int, Any] = {}
 
     def note(number: int, _: Any) -> None:
         requests.received = number

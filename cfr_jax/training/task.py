@@ -132,7 +132,9 @@ def fresh_params(config: TrainingConfig, chosen: Learner) -> dict:
     return params
 
 
-def _told(config, mixture, held_out, count, workdir):
+def _told(
+    config: TrainingConfig, mixture: Mixture, held_out: Mixture, count: int, workdir: Path
+) -> tuple[str, ...]:
     begun = config.train.start_from or "random numbers"
     told = [
         f"training on {mixture.told()}, from {begun}; "

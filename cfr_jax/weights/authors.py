@@ -9,7 +9,7 @@ whose weight (out, in) carries one or two more axes of length 1; our kernels are
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import jax
@@ -34,8 +34,12 @@ def convert(path: str | Path) -> dict:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"path: there is no checkpoint at {path}")
-    readers = {".pth": _read_torch, ".pt": _read_torch}
-    readers |= {".safetensors": load_file, ".npz": _read_npz}
+    readers: dict[str, Callable[[Path], dict[str, np.ndarray]]] = {
+        ".pth": _read_torch,
+        ".pt": _read_torch,
+        ".safetensors": lambda path: load_file(path),
+        ".npz": _read_npz,
+    }
     if path.suffix not in readers:
         raise ValueError(f"path: got a checkpoint {path.name}, wanted one of {', '.join(readers)}")
     try:
@@ -81,7 +85,7 @@ def from_state_dict(state: dict[str, np.ndarray], name: str = "state_dict") -> d
     return unflatten_dict({path: jnp.asarray(value) for path, value in joined.items()}, sep="/")
 
 
-def _recognized(names: Iterable[str], where: str) -> tuple[Network, Checkpoint]:
+def _recognized(names: Collection[str], where: str) -> tuple[Network, Checkpoint]:
     """The network whose authors published tensors of these names."""
     titles = []
     for record in map(table.network, table.names()):

@@ -160,7 +160,7 @@ def _check_shapes(path: Path, tensors: dict[str, np.ndarray], record: Network) -
             raise ValueError(f"weights: {path}: {name} is {tensors[name].dtype}, wanted float32")
 
 
-def _digest(tensors, notes):
+def _digest(tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any]) -> str:
     digest = hashlib.sha256(json.dumps(notes, sort_keys=True).encode())
     for name in sorted(tensors):
         array = np.ascontiguousarray(tensors[name])

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import jax
@@ -121,11 +121,11 @@ class ExportedRegister:
         found = self.exported.call(*arguments)
         if batched:
             found = {name: value[0] for name, value in found.items()}
-        found["weights"] = found["weights"][: len(source)]
-        found["covered"] = found["covered"][: len(target)]
+        found["weights"] = found["weights"][: np.shape(source)[0]]
+        found["covered"] = found["covered"][: np.shape(target)[0]]
         return found
 
-    def _padded(self, *clouds):
+    def _padded(self, *clouds: ArrayLike) -> Iterator[tuple[Array, Array]]:
         for name, cloud in zip(("source", "target"), clouds, strict=True):
             cloud = np.asarray(cloud, np.float32)
             if cloud.ndim != 2 or cloud.shape[1] != self.channels or len(cloud) < 3:

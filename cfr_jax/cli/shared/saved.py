@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -115,7 +116,7 @@ def as_scene(document: dict[str, Any], source: PointCloud, target: PointCloud) -
     return scene
 
 
-def _doubts(document, source, target):
+def _doubts(document: dict[str, Any], source: PointCloud, target: PointCloud) -> Iterator[str]:
     """The warnings of the result, and one more if its clouds do not fit as they did."""
     yield from document["warnings"]
     rows = np.random.default_rng(0).permutation(len(source))[:_COMPARED]

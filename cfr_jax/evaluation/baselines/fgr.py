@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -53,7 +55,7 @@ def then_icp(
     *,
     distances: tuple[float, ...],
     normal_radius: float,
-    **options,
+    **options: Any,
 ) -> Float[np.ndarray, "4 4"]:
     """FGR with these options, then point-to-plane ICP along `distances` on the full clouds."""
     methods = require("open3d").pipelines.registration

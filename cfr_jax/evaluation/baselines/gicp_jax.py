@@ -49,11 +49,11 @@ def _refine(
     source_normals: Float[Array, "n 3"],
     target_normals: Float[Array, "m 3"],
 ) -> Float[Array, "4 4"]:
-    surfaces = (
+    moving, fixed = (
         Surface(points, normals, jnp.ones(len(points), bool))
         for points, normals in ((source, source_normals), (target, target_normals))
     )
-    return jnp.asarray(refinement(DEFAULT)(*surfaces, jnp.eye(4)).transform)
+    return jnp.asarray(refinement(DEFAULT)(moving, fixed, jnp.eye(4)).transform)
 
 
 def _normals(cloud: PointCloud, radius: float) -> Float[np.ndarray, "n 3"]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -21,7 +21,7 @@ from cfr_jax.alignment.align import align
 from cfr_jax.alignment.planning import SETTINGS, planned
 from cfr_jax.evaluation import metrics
 from cfr_jax.evaluation.calibration.trials import Trial, Trials
-from cfr_jax.networks.cfr.registration import register
+from cfr_jax.networks.cfr.registration import Registration, register
 from cfr_jax.networks.probability import BIAS, KEY, Calibration, calibration_of, uncalibrated
 from cfr_jax.weights.files import load_params
 
@@ -44,7 +44,7 @@ class Gathered:
 
 
 def gather(
-    params: Mapping,
+    params: dict,
     trials: Trials,
     count: int,
     *,
@@ -99,7 +99,7 @@ def fit(clues: Float[np.ndarray, "n c"], right: Bool[np.ndarray, " n"]) -> np.nd
     center, spread = clues.mean(axis=0), clues.std(axis=0) + 1e-9
     design = np.column_stack([(clues - center) / spread, np.ones(len(clues))])
 
-    def loss(weights):
+    def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
         logit = design @ weights
         chance = 1 / (1 + np.exp(-logit))
         value = np.mean(np.logaddexp(0, logit) - right * logit) + _PENALTY * weights @ weights
@@ -133,7 +133,7 @@ def predicted(calibration: Calibration, found: Gathered, name: str) -> Float[np.
     return predict(np.array([*weights, fitted[BIAS]]), found.clues[name])
 
 
-def _row(params: Mapping, trial: Trial) -> list[float]:
+def _row(params: dict, trial: Trial) -> list[float]:
     """The clues of both answers to a trial, whether each is right, and the trial's group."""
     found = align(
         trial.source, trial.target, params=params, initial="global" if trial.searched else None
@@ -166,7 +166,9 @@ def is_right(
 
 
 @jax.jit
-def _register(params, source, target):
+def _register(
+    params: dict, source: solving.DeviceCloud, target: solving.DeviceCloud
+) -> Registration:
     return register(params, source.prepared(), target.prepared(), settings=SETTINGS)
 
 

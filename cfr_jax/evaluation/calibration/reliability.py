@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -91,11 +92,11 @@ def draw(path: Path, curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _share(right):
+def _share(right: np.ndarray) -> float:
     return round(float(right.mean()), 3) if len(right) else 0.0
 
 
-def _bins(chance, right, bins):
+def _bins(chance: np.ndarray, right: np.ndarray, bins: int) -> Iterator[tuple[float, float, float]]:
     """Mean confidence, share right, and share of all pairs, of each bin that is not empty."""
     place = np.minimum((chance * bins).astype(int), bins - 1)
     for b in range(bins):

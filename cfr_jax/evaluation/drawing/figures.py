@@ -56,7 +56,7 @@ def draw_all(
         return
     recall_over_error(folder / "recall.png", shown, angle, distance, unit)
     turned = metrics.err_r(
-        np.tile(np.eye(4), (len(pairs), 1, 1)), np.stack([pair.transform for pair in pairs])
+        np.tile(np.eye(4), (len(pairs), 1, 1)), np.array([pair.transform for pair in pairs])
     )
     by_quantity(folder / "by_rotation.png", shown, turned, "true rotation (degrees)", about)
     if all(pair.overlap is not None for pair in pairs):

@@ -76,7 +76,7 @@ def draw_gallery(path: Path, measured: Measured, records: Records, pairs: Sequen
 def _draw(axes: Axes, scene: Scene, station: int) -> None:
     """Both clouds, from back to front."""
     view = best_view(scene)
-    clouds = [_some(scene.target), _some(scene.moved(station))]
+    clouds = [_some(np.asarray(scene.target)), _some(scene.moved(station))]
     points = (np.concatenate(clouds) - view.center) @ view.rotation.T
     colors = np.repeat([_TARGET, _SOURCE], [len(cloud) for cloud in clouds])
     order = np.argsort(points[:, 2], kind="stable")

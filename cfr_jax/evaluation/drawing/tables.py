@@ -142,7 +142,7 @@ def _columns(
     """Of every metric that some method was measured by, and the recalls."""
     known = [metric for metric in metrics.table() if any(metric.name in m.errors for m in measured)]
     summaries = [summary for metric in known for summary in metric.summaries if summary.title]
-    return summaries + [metrics.recall(*each, unit) for each in thresholds]
+    return summaries + [metrics.recall(angle, distance, unit) for angle, distance in thresholds]
 
 
 def _value(number: Statistic | None, scale: float, form: str) -> str:

@@ -123,10 +123,13 @@ def _prepare_each(
         began = time.perf_counter()
         plan = planned(*clouds, max_points=max_points, seed=seed, settings=unit)
         batches = [
-            Cloud(*(None if a is None else jnp.asarray(a)[None] for a in parts))
-            for parts in (
-                (u.points, u.normals, u.neighbors, u.mask) for u in (plan.source, plan.target)
+            Cloud(
+                jnp.asarray(cloud.points)[None],
+                _unless_missing(None if cloud.normals is None else cloud.normals[None]),
+                jnp.asarray(cloud.neighbors)[None],
+                jnp.asarray(cloud.mask)[None],
             )
+            for cloud in (plan.source, plan.target)
         ]
         found, compiling = _run(program, params, *batches)
         seconds = time.perf_counter() - began - compiling
@@ -176,7 +179,7 @@ def _stacked(program: Program, pairs: Sequence[Pair], estimated: bool) -> list[C
         stacked.append(
             Cloud(
                 points=jnp.asarray(np.stack(points)),
-                normals=None if without else jnp.asarray(np.stack(normals), jnp.float32),
+                normals=_unless_missing(None if without else np.asarray(normals, np.float32)),
                 neighbors=jnp.asarray(np.stack(found)),
             )
         )
@@ -198,7 +201,7 @@ def _run(
 def _solve(
     params: dict, sources: Cloud, targets: Cloud, *, program: Program
 ) -> Float[Array, "b i 4 4"]:
-    def of_pair(pair):
+    def of_pair(pair: tuple[Cloud, Cloud]) -> Array:
         source, target = (_with_normals(cloud) for cloud in pair)
         transforms = _transforms(program, params, source, target)
         if program.refine is None:
@@ -216,13 +219,18 @@ def _transforms(
 ) -> Float[Array, "i 4 4"]:
     """Of all cascades, each started where the one before it ended."""
 
-    def cascade(start, _):
+    def cascade(start: Array, _: None) -> tuple[Array, Array]:
         steps = program.network.unroll(params, moved_by(start, source), target, program.settings)
         transforms = jnp.stack([rigid.compose(step.transform, start) for step in steps])
         return transforms[-1], transforms
 
     start = jnp.eye(4, dtype=jnp.float32)  # as the clouds of `_stacked` are
     return jax.lax.scan(cascade, start, length=program.cascades)[1].reshape(-1, 4, 4)
+
+
+def _unless_missing(normals: np.ndarray | None) -> Any:
+    """On the device; None goes into a `Cloud` only on its way to `_with_normals`."""
+    return None if normals is None else jnp.asarray(normals)
 
 
 def _with_normals(cloud: Cloud) -> Cloud:

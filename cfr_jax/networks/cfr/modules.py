@@ -59,7 +59,7 @@ class Cascade(nn.Module):
     iterations: int
     shared: bool = False
 
-    def setup(self):
+    def setup(self) -> None:
         count, d = 1 if self.shared else self.iterations, CHANNELS
         self.position = self.param("position", _stacked_init, (count, 3, d))
         self.scale = self.param("scale", nn.initializers.ones, (count, d))
@@ -100,12 +100,12 @@ class CFR(nn.Module):
     iterations: int = 5
     shared: bool = False
 
-    def setup(self):
+    def setup(self) -> None:
         self.features = PointFeatures()
         self.cascade = Cascade(self.iterations, self.shared)
         self.annealing = AnnealingNet(self.iterations)
 
-    def __call__(self, raw, source, target):
+    def __call__(self, raw: Array, source: Array, target: Array) -> object:
         """Touches every part once, so that `init` makes all parameters."""
         features = self.features(raw)
         return self.cascade.at_rest(features, source), self.annealing(source, target)

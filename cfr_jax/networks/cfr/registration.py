@@ -8,6 +8,7 @@ any pair there and back.
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +66,7 @@ def encode(
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
-def _encode(params, target, *, settings):
+def _encode(params: dict, target: Array | Cloud, *, settings: Settings) -> Encoded:
     return encoded(params, _prepared("target", target, settings), settings)
 
 
@@ -100,19 +101,28 @@ def register(
 
 
 @functools.partial(jax.jit, static_argnames=("iterations", "cascades", "settings"))
-def _register(params, source, target, *, iterations, cascades, settings):
+def _register(
+    params: dict,
+    source: Array | Cloud,
+    target: Array | Cloud | Encoded,
+    *,
+    iterations: int | None,
+    cascades: int,
+    settings: Settings,
+) -> Registration:
     iterations = iterations_of(params) if iterations is None else iterations
     for name, count in (("iterations", iterations), ("cascades", cascades)):
         if count < 1:
             raise ValueError(f"{name}: got {count}, wanted at least 1")
     source = _prepared("source", source, settings)
-    if not isinstance(target, Encoded):
-        target = _encode(params, target, settings=settings)
+    reference: Encoded = (
+        target if isinstance(target, Encoded) else _encode(params, target, settings=settings)
+    )
 
-    def cascade(start, _):
+    def cascade(start: Array, _: None) -> tuple[Array, dict]:
         start = lax.stop_gradient(start) if settings.detach_motion else start
         moved = moved_on(start, source, settings)
-        steps = list(iterate(params, moved, target, iterations, settings))
+        steps = list(iterate(params, moved, reference, iterations, settings))
         transforms = jnp.stack([rigid.compose(step.transform, start) for step in steps])
         found = {
             "transforms": transforms,
@@ -125,7 +135,7 @@ def _register(params, source, target, *, iterations, cascades, settings):
         return transforms[-1], found
 
     # a loop, since it is compiled once however many there are
-    start = jnp.eye(4, dtype=jnp.result_type(source.points, target.cloud.points))
+    start = jnp.eye(4, dtype=jnp.result_type(source.points, reference.cloud.points))
     found = lax.scan(cascade, start, length=cascades)[1]
     of_all = {name: jnp.concatenate(found[name]) for name in ("transforms", "beta", "alpha")}
     of_last = {name: found[name][-1] for name in ("weights", "covered", "targets")}
@@ -136,20 +146,20 @@ def _register(params, source, target, *, iterations, cascades, settings):
         of_last["weights"],
         of_last["covered"],
         source.mask,
-        target.cloud.mask,
+        reference.cloud.mask,
     )
     confidence = of_registration(calibration_of(params), clues)
     return Registration(**of_all, **of_last, clues=clues, confidence=confidence)
 
 
-def _prepared(name, cloud, settings):
+def _prepared(name: str, cloud: Array | Cloud, settings: Settings) -> Cloud:
     if isinstance(cloud, Cloud):
         return cloud
     check_points(name, cloud)
     return prepare(cloud, settings=settings)
 
 
-def _checked(clouds):
+def _checked(clouds: dict[str, Any]) -> Array | None:
     """Refuses what a compiled function cannot tell, where it is known by now. What is on the device
     stays there: the answer is one flag that it makes, whether those values are finite."""
     on_device = []
@@ -173,11 +183,11 @@ def _checked(clouds):
 
 
 @jax.jit
-def _all_finite(clouds):
+def _all_finite(clouds: list[Array]) -> Array:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(cloud)) for cloud in clouds]))
 
 
-def _refuse_unless(finite, clouds):
+def _refuse_unless(finite: Array | None, clouds: dict[str, Any]) -> None:
     """Raises ValueError for values on the device that are not finite. To be asked when the work has
     been handed to the device: only the flag is waited for, and rows are fetched for the message."""
     if finite is not None and not jax.device_get(finite):
@@ -186,7 +196,7 @@ def _refuse_unless(finite, clouds):
                 _check_finite(name, jax.device_get(cloud))
 
 
-def _check_finite(name, cloud):
+def _check_finite(name: str, cloud: np.ndarray) -> None:
     wrong = np.flatnonzero(~np.isfinite(cloud).all(axis=1))
     if len(wrong):
         raise ValueError(

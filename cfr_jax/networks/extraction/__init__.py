@@ -29,7 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from cfr_jax.networks.extraction.backward import backward
-from cfr_jax.networks.extraction.forward import forward
+from cfr_jax.networks.extraction.forward import Kept, forward
 from cfr_jax.networks.extraction.mixed import pooled_mixed
 from cfr_jax.networks.extraction.tiles import ACCELERATOR, CPU, Limits, kept_of, tiling_of
 from cfr_jax.networks.layers import Layer
@@ -69,12 +69,19 @@ def pooled_features(
     return _pooled(layers, raw, valid, groups, (on_cpu, elsewhere)) * valid[:, None]
 
 
+_Layers = tuple[Layer, Layer, Layer]
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
-def _pooled(layers, raw, valid, groups, limits):
+def _pooled(
+    layers: _Layers, raw: Array, valid: Array, groups: int, limits: tuple[Limits, ...]
+) -> Array:
     return _pooled_fwd(layers, raw, valid, groups, limits)[0]
 
 
-def _pooled_fwd(layers, raw, valid, groups, limits):
+def _pooled_fwd(
+    layers: _Layers, raw: Array, valid: Array, groups: int, limits: tuple[Limits, ...]
+) -> tuple[Array, tuple[_Layers, Array, Array, Kept]]:
     n, k, _ = raw.shape
     # as many rows on every platform, since it is one program until it is lowered
     tiling = tiling_of(n, k, limits[0])
@@ -85,7 +92,12 @@ def _pooled_fwd(layers, raw, valid, groups, limits):
     return pooled, (layers, raw, valid, kept)
 
 
-def _pooled_bwd(groups, limits, residuals, gradient):
+def _pooled_bwd(
+    groups: int,
+    limits: tuple[Limits, ...],
+    residuals: tuple[_Layers, Array, Array, Kept],
+    gradient: Array,
+) -> tuple[_Layers, Array, Array]:
     ways = (functools.partial(backward, groups=groups, limits=one) for one in limits)
     return cloud_by_cloud(*ways)(*residuals, gradient)
 

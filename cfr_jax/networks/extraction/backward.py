@@ -33,18 +33,18 @@ def backward(
     tiles = cut_rows(raw, tiling)
     weights = jnp.repeat(cut(valid, tiling), k, axis=1)
     # what was kept serves where it fills whole tiles
-    some = min(tiling.count, len(second) // tiles.shape[1])
+    some = min(tiling.number, len(second) // tiles.shape[1])
     second = second[: some * tiles.shape[1]].reshape(some, tiles.shape[1], two.bias.size)
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
     kernel_first, bias_first = fold(one, norm_one)
 
-    def first(raw):
+    def first(raw: Array) -> Array:
         return jax.nn.relu(raw @ kernel_first + bias_first)
 
-    def again(raw):
+    def again(raw: Array) -> Array:
         return first(raw) @ two.kernel
 
-    def normal_two(z):
+    def normal_two(z: Array) -> Array:
         return (z + (two.bias - norm_two.mean)) * norm_two.rate
 
     # Third norm: only the extreme of each point receives gradient, so its projections are sums over
@@ -56,7 +56,9 @@ def backward(
     at_extreme = gradient * three.scale * norm_three.rate
     at_extreme = cut(at_extreme, tiling)
 
-    def through_three(sums, z_two, raw, weight, incoming):
+    def through_three(
+        sums: tuple[Array, ...], z_two: Array, raw: Array, weight: Array, incoming: Array
+    ) -> tuple[tuple[Array, ...], Array]:
         n_two = normal_two(z_two)
         y_two = jax.nn.relu(n_two * two.scale + two.shift)
         z = y_two @ three.kernel + three.bias
@@ -84,7 +86,9 @@ def backward(
     flat_two, tilt_two = projections(two, shift_two, scale_two, rows, groups)
     gain_one = one.kernel * (one.scale * norm_one.rate)
 
-    def through_two(sums, z_two, raw, weight, d_n):
+    def through_two(
+        sums: tuple[Array, ...], z_two: Array, raw: Array, weight: Array, d_n: Array
+    ) -> tuple[tuple[Array, ...], Array]:
         y_one = first(raw)
         dense = (flat_two + tilt_two * normal_two(z_two)) * weight[:, None]
         d_z = (d_n * two.scale - dense) * norm_two.rate

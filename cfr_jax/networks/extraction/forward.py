@@ -39,16 +39,16 @@ def forward(
     n = raw.shape[0]
     widths = [layer.bias.size for layer in layers]
 
-    def of_points():
+    def of_points() -> tuple[Array, Kept]:
         pooled, kept = _forward(layers, raw, valid, groups, limits)
         second = kept.second.reshape(-1, widths[1])[:rows_kept]
         more = rows_kept - len(second)  # where another platform's tiles hold more padding
         return pooled, kept._replace(second=jnp.pad(second, ((0, more), (0, 0))))
 
-    def of_none():
-        norms = tuple(Norm(*2 * (jnp.zeros(width, raw.dtype),)) for width in widths)
+    def of_none() -> tuple[Array, Kept]:
+        one, two, three = (Norm(*2 * (jnp.zeros(width, raw.dtype),)) for width in widths)
         pooled = jnp.zeros((n, widths[-1]), raw.dtype)
-        return pooled, Kept(norms, pooled, jnp.zeros((rows_kept, widths[1]), raw.dtype))
+        return pooled, Kept((one, two, three), pooled, jnp.zeros((rows_kept, widths[1]), raw.dtype))
 
     if limits.at_once > 1:
         return of_points()  # an accelerator would have to ask the host which branch to take
@@ -60,7 +60,9 @@ def forward(
     return lax.cond(some, of_points, of_none)
 
 
-def _forward(layers, raw, valid, groups, limits):
+def _forward(
+    layers: tuple[Layer, Layer, Layer], raw: Array, valid: Array, groups: int, limits: Limits
+) -> tuple[Array, Kept]:
     one, two, three = layers
     n, k, _ = raw.shape
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
@@ -70,12 +72,12 @@ def _forward(layers, raw, valid, groups, limits):
     norm_one = norm_of(*_moments_of_first(one, tiles, cut(valid, tiling), rows), groups)
     kernel_one, bias_one = fold(one, norm_one)
 
-    def second(raw):
+    def second(raw: Array) -> Array:
         return jax.nn.relu(raw @ kernel_one + bias_one) @ two.kernel
 
     # Both passes leave sums per point, and the mask weighs them afterwards: reductions that follow
     # a product directly are fused into it on CPU.
-    def statistics(_, raw):
+    def statistics(_: None, raw: Array) -> tuple[None, tuple[Array, tuple[Array, Array]]]:
         z = second(raw)
         return None, (z, _sums_of_neighbors(z, k))
 
@@ -92,7 +94,7 @@ def _forward(layers, raw, valid, groups, limits):
     sign = jnp.where(three.scale >= 0, 1, -1).astype(raw.dtype)
     kernel_three = three.kernel * sign
 
-    def extremes(_, z, raw):
+    def extremes(_: None, z: Array, raw: Array) -> tuple[None, tuple[tuple[Array, Array], Array]]:
         z = jax.nn.relu(z * gain + level) @ kernel_three
         return None, (_sums_of_neighbors(z, k), z.reshape(-1, k, z.shape[-1]).max(1))
 
@@ -104,24 +106,28 @@ def _forward(layers, raw, valid, groups, limits):
     return pooled, Kept((norm_one, norm_two, norm_three), normal, kept)
 
 
-def _sums_of_neighbors(z, k):
+def _sums_of_neighbors(z: Array, k: int) -> tuple[Array, Array]:
     z = z.reshape(-1, k, z.shape[-1])
     return z.sum(1), (z * z).sum(1)
 
 
-def _moments(sums, valid, rows, bias, sign=1):
+def _moments(
+    sums: tuple[Array, Array], valid: Array, rows: Array, bias: Array, sign: Array | int = 1
+) -> tuple[Array, Array]:
     """Mean and variance of a layer's output from each point's sums over its neighbors."""
     total, square = (valid @ sum_.reshape(-1, bias.size)[: valid.size] / rows for sum_ in sums)
     return total * sign + bias, square - total * total
 
 
-def _moments_of_first(layer, tiles, weights, rows):
+def _moments_of_first(
+    layer: Layer, tiles: Array, weights: Array, rows: Array
+) -> tuple[Array, Array]:
     # tile by tile: on CPU the product copies what it is made of
     channels = tiles.shape[-1]
     neighbors = tiles.reshape(*weights.shape, -1, channels)
     mean = jnp.sum(weights[:, :, None, None] * neighbors, (0, 1, 2)) / rows
 
-    def add(gram, tile):
+    def add(gram: Array, tile: tuple[Array, Array]) -> tuple[Array, None]:
         raw, weight = tile
         centered = ((raw - mean) * weight[:, None, None]).reshape(-1, channels)
         return gram + jnp.matmul(centered.T, centered, precision=_HIGHEST), None

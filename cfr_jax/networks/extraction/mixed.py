@@ -23,6 +23,13 @@ from jaxtyping import Array, Float
 
 from cfr_jax.networks.layers import Layer, Norm, fold, norm_of, projections
 
+_Layers = tuple[Layer, Layer, Layer]
+_Kept = tuple[
+    tuple[Array, Array, Array, Array], tuple[Norm, Norm, Norm],
+    Array, Array, Array, Array, Array, Array,
+]  # fmt: skip
+"""Means and a covariance, norms, what was pooled, and the layers' inputs and outputs."""
+
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
 def pooled_mixed(
@@ -37,7 +44,9 @@ def pooled_mixed(
     return _forward(layers, raw, valid, groups, stored)[0]
 
 
-def _forward(layers, raw, valid, groups, stored):
+def _forward(
+    layers: _Layers, raw: Array, valid: Array, groups: int, stored: DTypeLike
+) -> tuple[Array, tuple[_Layers, Array, Array, _Kept]]:
     one, two, three = layers
     count = jnp.maximum(jnp.sum(valid) * raw.shape[1], 1)
 
@@ -67,7 +76,9 @@ def _forward(layers, raw, valid, groups, stored):
     return pooled, (layers, raw, valid, kept)
 
 
-def _backward(groups, stored, residuals, gradient):
+def _backward(
+    groups: int, stored: DTypeLike, residuals: tuple[_Layers, Array, Array, _Kept], gradient: Array
+) -> tuple[_Layers, Array, Array]:
     (one, two, three), raw, valid, kept = residuals
     (mean, covariance, mean_two, mean_three), norms, normal, x, y_one, z_two, y_two, z_three = kept
     norm_one, norm_two, norm_three = norms
@@ -129,7 +140,7 @@ def _backward(groups, stored, residuals, gradient):
 pooled_mixed.defvjp(_forward, _backward)
 
 
-def _moments_of_raw(raw, valid, count):
+def _moments_of_raw(raw: Array, valid: Array, count: Array) -> tuple[Array, Array]:
     """Mean and covariance of the raw channels. Summed, not multiplied: a product of so few columns
     leaves a GPU's units empty, and would be rounded there."""
     weight = valid[:, None, None]
@@ -143,7 +154,9 @@ def _moments_of_raw(raw, valid, count):
     return mean, sums[place]
 
 
-def _norm(z, valid, count, bias, groups, sign=1):
+def _norm(
+    z: Array, valid: Array, count: Array, bias: Array, groups: int, sign: Array | int = 1
+) -> tuple[Array, Norm]:
     """Mean of each channel of z sign + bias, and the norm."""
     values = z.astype(bias.dtype)  # on its way into the sums
     total, square = (
@@ -153,23 +166,23 @@ def _norm(z, valid, count, bias, groups, sign=1):
     return mean, norm_of(mean, square - total * total, groups)
 
 
-def _sum(values):
+def _sum(values: Array) -> Array:
     """Over points and neighbors: over the neighbors first, next to each other in memory."""
     return with_layout_constraint(values, Layout((0, 1, 2))).sum((0, 1))
 
 
-def _affine(layer: Layer, norm: Norm):
+def _affine(layer: Layer, norm: Norm) -> tuple[Array, Array]:
     """The norm of z + bias with its scale and shift, as one gain and one level."""
     gain = layer.scale * norm.rate
     return gain, (layer.bias - norm.mean) * gain + layer.shift
 
 
-def _normalizing(norm: Norm, bias):
+def _normalizing(norm: Norm, bias: Array) -> tuple[Array, Array]:
     """The norm of z + bias as one slope and one offset."""
     return norm.rate, (bias - norm.mean) * norm.rate
 
 
-def _over_rows(left, right):
+def _over_rows(left: Array, right: Array) -> Array:
     """left' right over all rows, summed in float32."""
     left, right = (rows.reshape(-1, rows.shape[-1]) for rows in (left, right))
     return jnp.matmul(left.T, right, preferred_element_type=jnp.float32)

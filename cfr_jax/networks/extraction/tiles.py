@@ -32,9 +32,9 @@ ACCELERATOR = Limits(kept=1 << 29, at_once=512)
 
 
 class Tiling(NamedTuple):
-    """`count` tiles of `size` points each; the last may be padded."""
+    """`number` tiles of `size` points each; the last may be padded."""
 
-    count: int
+    number: int
     size: int
 
 
@@ -48,19 +48,19 @@ def tiling_of(n: int, k: int, limits: Limits) -> Tiling:
 
 def kept_of(tiling: Tiling, k: int, width: int, limits: Limits) -> int:
     """How many of the tiles are kept in a layer of that width."""
-    return max(1, min(tiling.count, limits.kept // (tiling.size * k * width)))
+    return max(1, min(tiling.number, limits.kept // (tiling.size * k * width)))
 
 
 def cut(values: Array, tiling: Tiling) -> Array:
     """Points (n, ...) cut into tiles (count, size, ...), padded to whole ones."""
-    more = tiling.count * tiling.size - values.shape[0]
+    more = tiling.number * tiling.size - values.shape[0]
     padded = jnp.pad(values, [(0, more)] + [(0, 0)] * (values.ndim - 1))
     return padded.reshape(*tiling, *values.shape[1:])
 
 
 def cut_rows(raw: Float[Array, "n k c"], tiling: Tiling) -> Float[Array, "count rows c"]:
     """The same, neighbor by neighbor."""
-    return cut(raw, tiling).reshape(tiling.count, -1, raw.shape[-1])
+    return cut(raw, tiling).reshape(tiling.number, -1, raw.shape[-1])
 
 
 def scan(

@@ -9,7 +9,7 @@ GPU's kernel, `log_space` is the published one that they are compared with.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from jaxtyping import Array, Bool, Float
 
@@ -63,23 +63,23 @@ def form_for(n: int, m: int, platform: Platform) -> Form:
     return "dense" if n * m <= _STORED[platform] else "streamed"
 
 
-def _match_streamed(affinity, points, **rest):
+def _match_streamed(affinity: Affinity, points: Array, **rest: Any) -> Match:
     return _by_hand(affinity, points, [_streamed(affinity, each) for each in _STREAMED], **rest)
 
 
-def _match_fused(affinity, points, **rest):
+def _match_fused(affinity: Affinity, points: Array, **rest: Any) -> Match:
     return _by_hand(affinity, points, 2 * [Way("fused", _TILE)], **rest)
 
 
-def _by_hand(affinity, points, ways, **rest):
+def _by_hand(affinity: Affinity, points: Array, ways: list[Way], **rest: Any) -> Match:
     return match_by_hand(affinity, points, on_cpu=ways[0], elsewhere=ways[1], **rest)
 
 
-def _streamed(affinity, platform):
+def _streamed(affinity: Affinity, platform: Platform) -> Way:
     return Way("streamed", rows_of(affinity.target.shape[0], _STREAMED[platform]))
 
 
-def _match_by_size(affinity, points, **rest):
+def _match_by_size(affinity: Affinity, points: Array, **rest: Any) -> Match:
     sizes = affinity.source.shape[0], affinity.target.shape[0]
     forms = [form_for(*sizes, platform) for platform in _STORED]
     if forms[0] == "dense":

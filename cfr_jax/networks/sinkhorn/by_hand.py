@@ -7,7 +7,8 @@ program that is not yet lowered can hold one for CPUs and another for the rest.
 from __future__ import annotations
 
 import functools
-from typing import Literal, NamedTuple
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,8 @@ from jaxtyping import Array, Bool, Float
 
 from cfr_jax.networks.sinkhorn import scaling, streamed
 from cfr_jax.networks.sinkhorn.affinity import Affinity, Match
+
+_Masks = tuple[Array, Array]
 
 
 class Way(NamedTuple):
@@ -39,20 +42,26 @@ def match_by_hand(
 ) -> Match:
     """`match` in the way of the platform that the program is lowered for."""
     sizes = affinity.source.shape[0], affinity.target.shape[0]
-    masks = tuple(
+    of_source, of_target = (
         jnp.ones(size, bool) if mask is None else mask
         for mask, size in zip((source_mask, target_mask), sizes, strict=True)
     )
-    return _match(affinity, points, masks, passes, (on_cpu, elsewhere))
+    return _match(affinity, points, (of_source, of_target), passes, (on_cpu, elsewhere))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
-def _match(affinity, points, masks, passes, ways):
+def _match(
+    affinity: Affinity, points: Array, masks: _Masks, passes: int, ways: tuple[Way, Way]
+) -> Match:
     return _forward(affinity, points, masks, passes, ways)[0]
 
 
-def _forward(affinity, points, masks, passes, ways):
-    def run(way, affinity, points, masks):
+def _forward(
+    affinity: Affinity, points: Array, masks: _Masks, passes: int, ways: tuple[Way, Way]
+) -> tuple[Match, tuple[Affinity, Array, _Masks, scaling.Trace]]:
+    def run(
+        way: Way, affinity: Affinity, points: Array, masks: _Masks
+    ) -> tuple[Match, scaling.Trace]:
         if way.kind == "streamed":
             return streamed.forward(affinity, points, masks, passes=passes, rows=way.rows)
         return scaling.forward(_block(way, affinity, masks), points, passes)
@@ -61,8 +70,20 @@ def _forward(affinity, points, masks, passes, ways):
     return found, (affinity, points, masks, trace)
 
 
-def _backward(passes, ways, residuals, gradient):
-    def run(way, affinity, points, masks, trace, gradient):
+def _backward(
+    passes: int,
+    ways: tuple[Way, Way],
+    residuals: tuple[Affinity, Array, _Masks, scaling.Trace],
+    gradient: Match,
+) -> tuple[Affinity, Array, None]:
+    def run(
+        way: Way,
+        affinity: Affinity,
+        points: Array,
+        masks: _Masks,
+        trace: scaling.Trace,
+        gradient: Match,
+    ) -> tuple[Affinity, Array]:
         if way.kind == "streamed":
             return streamed.backward(
                 affinity, points, masks, trace, gradient, passes=passes, rows=way.rows
@@ -76,7 +97,9 @@ def _backward(passes, ways, residuals, gradient):
 _match.defvjp(_forward, _backward)
 
 
-def _block(way, affinity, masks, shift=None) -> scaling.Block:
+def _block(
+    way: Way, affinity: Affinity, masks: _Masks, shift: Array | None = None
+) -> scaling.Block:
     if way.kind == "fused":
         # imported here: Pallas takes a quarter of a second that no other form needs
         from cfr_jax.networks.sinkhorn import fused
@@ -85,7 +108,7 @@ def _block(way, affinity, masks, shift=None) -> scaling.Block:
     return scaling.Stored(affinity, masks, shift)
 
 
-def _by_platform(run, ways, *arguments):
+def _by_platform(run: Callable[..., Any], ways: tuple[Way, Way], *arguments: Any) -> Any:
     on_cpu, elsewhere = (functools.partial(run, way) for way in ways)
     if ways[0] == ways[1]:
         return on_cpu(*arguments)

@@ -13,6 +13,8 @@ Elsewhere than on GPUs the kernels are interpreted, which is slow and gives the 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +25,8 @@ from jaxtyping import Array, Bool, Float
 
 from cfr_jax.networks.sinkhorn.affinity import Affinity, log_affinity
 from cfr_jax.networks.sinkhorn.scaling import Spent
+
+_Ref = Any  # an array as a kernel sees it; Pallas has no public class for it
 
 _CHUNK = 32  # channels of a product; what a kernel holds has powers of two for sizes
 
@@ -59,7 +63,15 @@ class Fused:
         target, _ = self._run(_spent, (right, left), flip=True, sums=width, more=2)
         return Spent(source, target, jnp.sum(sums[:, 0]), jnp.sum(sums[:, 1]))
 
-    def _run(self, kernel, others, *, flip, sums, more=0):
+    def _run(
+        self,
+        kernel: Callable[..., None],
+        others: tuple[Array | None, ...],
+        *,
+        flip: bool,
+        sums: int,
+        more: int = 0,
+    ) -> tuple[Array, ...]:
         """A kernel over the rows, or with the clouds exchanged; `others`: an array of the rows and
         one of the columns, if any. Arrays (rows, sums), and (rows, more)."""
         clouds = [self.affinity.source, self.affinity.target]
@@ -69,7 +81,18 @@ class Fused:
         return _call(kernel, self.size, sums, more, annealing, here, there, *less, *others)
 
 
-def _call(kernel, size, sums, more, annealing, here, there, less_here, less_there, *others):
+def _call(
+    kernel: Callable[..., None],
+    size: int,
+    sums: int,
+    more: int,
+    annealing: Array,
+    here: Array,
+    there: Array,
+    less_here: Array,
+    less_there: Array,
+    *others: Array | None,
+) -> tuple[Array, ...]:
     n, wide = here.shape[0], kernel is _spent
     here, there = (_padded(_padded(part, 0, size), 1, _CHUNK) for part in (here, there))
     less = [_padded(part, 0, size, jnp.inf) for part in (less_here, less_there)]
@@ -81,17 +104,18 @@ def _call(kernel, size, sums, more, annealing, here, there, less_here, less_ther
         _whole(there),
         _whole(less[1]),
     ]
-    if others and others[0] is not None:
-        given.append(_padded(others[0], 0, size))
+    of_rows, of_columns = others or (None, None)
+    if of_rows is not None:
+        given.append(_padded(of_rows, 0, size))
         specs.append(pl.BlockSpec((size, given[-1].shape[1]), lambda i: (i, 0)))
-    if others:
-        given.append(_padded(others[1], 0 if wide else 1, size))
+    if of_columns is not None:
+        given.append(_padded(of_columns, 0 if wide else 1, size))
         specs.append(_whole(given[-1]))
     # a kernel's arrays are as wide as powers of two; sums that are not, one after the other
     widths = [here.shape[1], more] if wide else [sums]
     shapes = [(here.shape[0], width) for width in widths]
 
-    def run(*given, interpret):
+    def run(*given: Array, interpret: bool) -> Sequence[Array]:
         return pl.pallas_call(
             functools.partial(kernel, tiles=there.shape[0] // size),
             out_shape=[jax.ShapeDtypeStruct(shape, here.dtype) for shape in shapes],
@@ -108,35 +132,46 @@ def _call(kernel, size, sums, more, annealing, here, there, less_here, less_ther
     return (first, found[1][:n]) if wide else (first,)
 
 
-def _padded(part, axis, size, fill=0):
+def _padded(part: Array, axis: int, size: int, fill: float = 0.0) -> Array:
     pad = [(0, 0)] * part.ndim
     pad[axis] = (0, -part.shape[axis] % size)
     return jnp.pad(part, pad, constant_values=fill)
 
 
-def _whole(part):
+def _whole(part: Array) -> pl.BlockSpec:
     return pl.BlockSpec(part.shape, lambda i: (0,) * part.ndim)
 
 
-def _logs(annealing, here, less_here, there, less_there, tile):
+def _logs(
+    annealing: _Ref, here: _Ref, less_here: _Ref, there: _Ref, less_there: _Ref, tile: Array
+) -> tuple[Array, Array, pl.Slice | slice]:
     """Log affinities, lessened, of this program's rows and a tile of columns; |f - g|^2; which."""
     size = less_here.shape[0]
     columns = pl.ds(tile * size, size)
-    product = sum(
+    products = (
         _dot(here[:, pl.ds(start, _CHUNK)], there[columns, pl.ds(start, _CHUNK)].T)
         for start in range(0, here.shape[1], _CHUNK)
     )
-    square = 2 - 2 * product
+    square = 2 - 2 * functools.reduce(jnp.add, products)
     logs = log_affinity(square, annealing[0], annealing[1])
     return logs - less_here[:][:, None] - less_there[columns][None], square, columns
 
 
-def _dot(a, b):
+def _dot(a: Array, b: Array) -> Array:
     return jnp.dot(a, b, precision=lax.Precision.HIGHEST)
 
 
-def _highest(annealing, here, less_here, there, less_there, out, *, tiles):
-    def step(tile, high):
+def _highest(
+    annealing: _Ref,
+    here: _Ref,
+    less_here: _Ref,
+    there: _Ref,
+    less_there: _Ref,
+    out: _Ref,
+    *,
+    tiles: int,
+) -> None:
+    def step(tile: Array, high: Array) -> Array:
         logs, *_ = _logs(annealing, here, less_here, there, less_there, tile)
         return jnp.maximum(high, jnp.max(logs, axis=1))
 
@@ -144,10 +179,20 @@ def _highest(annealing, here, less_here, there, less_there, out, *, tiles):
     out[:, 0] = lax.fori_loop(0, tiles, step, lowest)
 
 
-def _sums(annealing, here, less_here, there, less_there, weights, out, *, tiles):
+def _sums(
+    annealing: _Ref,
+    here: _Ref,
+    less_here: _Ref,
+    there: _Ref,
+    less_there: _Ref,
+    weights: _Ref,
+    out: _Ref,
+    *,
+    tiles: int,
+) -> None:
     count = weights.shape[0]
 
-    def step(tile, sums):
+    def step(tile: Array, sums: list[Array]) -> list[Array]:
         logs, _, columns = _logs(annealing, here, less_here, there, less_there, tile)
         block = jnp.exp(logs)
         return [
@@ -161,11 +206,23 @@ def _sums(annealing, here, less_here, there, less_there, weights, out, *, tiles)
 
 
 def _spent(
-    annealing, here, less_here, there, less_there, left, right, of_here, of_annealing, *, tiles
-):
+    annealing: _Ref,
+    here: _Ref,
+    less_here: _Ref,
+    there: _Ref,
+    less_there: _Ref,
+    left: _Ref,
+    right: _Ref,
+    of_here: _Ref,
+    of_annealing: _Ref,
+    *,
+    tiles: int,
+) -> None:
     starts = range(0, here.shape[1], _CHUNK)
 
-    def step(tile, state):
+    def step(
+        tile: Array, state: tuple[list[Array], Array, Array]
+    ) -> tuple[list[Array], Array, Array]:
         of_features, of_beta, of_alpha = state
         logs, square, columns = _logs(annealing, here, less_here, there, less_there, tile)
         thin = sum(
@@ -182,8 +239,8 @@ def _spent(
 
     size, dtype = less_here.shape[0], here.dtype
     nothing = jnp.zeros(size, dtype)
-    start = [jnp.zeros((size, _CHUNK), dtype) for _ in starts], nothing, nothing
-    of_features, of_beta, of_alpha = lax.fori_loop(0, tiles, step, start)
+    zeros = [jnp.zeros((size, _CHUNK), dtype) for _ in starts], nothing, nothing
+    of_features, of_beta, of_alpha = lax.fori_loop(0, tiles, step, zeros)
     for total, start in zip(of_features, starts, strict=True):
         of_here[:, pl.ds(start, _CHUNK)] = total
     of_annealing[:, 0] = of_beta

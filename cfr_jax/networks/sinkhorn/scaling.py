@@ -67,8 +67,8 @@ def forward(block: Block, points: Float[Array, "m 3"], passes: int) -> tuple[Mat
         every.append((u, v))
         v = 1 / (found + 1)
     sums = u[:, None] * block.rows(v[:, None] * with_ones(points))
-    scalings = (jnp.stack(part) for part in zip(*every, strict=True))
-    return match_of(sums, v * found), Trace(*scalings, v, block.shift, sums)
+    u_of_all, v_before = (jnp.stack(part) for part in zip(*every, strict=True))
+    return match_of(sums, v * found), Trace(u_of_all, v_before, v, block.shift, sums)
 
 
 def backward(

@@ -35,6 +35,9 @@ from cfr_jax.networks.sinkhorn.affinity import (
 _LEAST_ROWS = 128
 _HIGHEST = lax.Precision.HIGHEST
 
+_Rows = tuple[Array, Array]  # features of a block of rows, and their mask
+_Shifted = tuple[_Rows, Array]
+
 
 def rows_of(m: int, entries: int) -> int:
     """The rows of a block of so many entries."""
@@ -54,14 +57,16 @@ def forward(
     blocks = _Blocks(affinity, masks, rows)
     tiny = jnp.finfo(points.dtype).tiny
 
-    def one_pass(v, shift=None):
-        def rows(found, here):
+    def one_pass(
+        v: Array, shift: Array | None = None
+    ) -> tuple[Array, tuple[Array, Array, Array], Array]:
+        def rows(found: Array, here: tuple) -> tuple[Array, tuple[Array, Array]]:
             block, _, shift = blocks.make(*here)
             sums = jnp.matmul(block, v, precision=_HIGHEST) + jnp.exp(-shift)
             u = 1 / jnp.maximum(sums, tiny)
             return found + jnp.matmul(u, block, precision=_HIGHEST), (u, shift)
 
-        given = (blocks.rows,) if shift is None else (blocks.rows, shift)
+        given: tuple = (blocks.rows,) if shift is None else (blocks.rows, shift)
         found, (u, shift) = lax.scan(rows, jnp.zeros(m, v.dtype), given)
         return 1 / (found + 1), (u, v, found), shift
 
@@ -71,7 +76,7 @@ def forward(
     u, v_before, found = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, others)
     weighted = v[:, None] * with_ones(points)
 
-    def last(here):
+    def last(here: tuple[_Rows, Array, Array]) -> Array:
         rows, shift, u = here
         return u[:, None] * jnp.matmul(blocks.make(rows, shift)[0], weighted, precision=_HIGHEST)
 
@@ -95,37 +100,39 @@ def backward(
     blocks = _Blocks(affinity, masks, rows)
     u = jnp.stack([blocks.cut(one, 1) for one in trace.u])
     v_before, v, sums = trace.v_before, trace.v, trace.sums
-    rows = (blocks.rows, blocks.cut(trace.shift))
+    shifted = (blocks.rows, blocks.cut(trace.shift))
 
     # from the match to the sums, to the last scaling of the rows
     of_sums = gradient_of_sums(gradient, sums)
     pull = blocks.cut(of_sums) * u[-1][..., None]
     of_u = jnp.sum(blocks.cut(of_sums * sums), axis=-1) / u[-1]
 
-    def columns(total, here):
+    def columns(total: Array, here: tuple[_Shifted, Array]) -> tuple[Array, None]:
         rows, pull = here
         block, *_ = blocks.make(*rows)
         return total + jnp.matmul(block.T, pull, precision=_HIGHEST), None
 
-    of_weighted, _ = lax.scan(columns, jnp.zeros((m, 4), points.dtype), (rows, pull))
+    of_weighted, _ = lax.scan(columns, jnp.zeros((m, 4), points.dtype), (shifted, pull))
     one = with_ones(points)
     of_v = jnp.sum(of_weighted * one, axis=1) - gradient.covered  # covered is 1 - v
 
-    def of_rows(block, a, u, of_u):
+    def of_rows(block: Array, a: Array, u: Array, of_u: Array) -> Array:
         return gradient_of_scaling(u, jnp.matmul(block, a, precision=_HIGHEST) + of_u)
 
-    def back(state, one_pass):
+    def back(
+        state: tuple[Array, Array], one_pass: tuple[Array, Array]
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         of_v, of_u = state
         u, v = one_pass
         a = -v * (v * of_v)
 
-        def step(total, here):
+        def step(total: Array, here: tuple[_Shifted, Array, Array]) -> tuple[Array, Array]:
             rows, u, of_u = here
             block, *_ = blocks.make(*rows)
             b = of_rows(block, a, u, of_u)
             return total + jnp.matmul(b, block, precision=_HIGHEST), b
 
-        of_v, b = lax.scan(step, jnp.zeros_like(v), (rows, u, of_u))
+        of_v, b = lax.scan(step, jnp.zeros_like(v), (shifted, u, of_u))
         return (of_v, jnp.zeros_like(of_u)), (a, b)
 
     v_after = jnp.concatenate([v_before[1:], v[None]])
@@ -136,7 +143,9 @@ def backward(
     # log m_ij receives m_ij times left_i . right_j
     right = jnp.concatenate([a, v_before, (v[:, None] * one).T])
 
-    def spend(state, here):
+    def spend(
+        state: tuple[Array, Array, Array], here: tuple
+    ) -> tuple[tuple[Array, Array, Array], Array]:
         rows, u, b, pull, of_u = here
         of_target, of_beta, of_alpha = state
         block, square, _ = blocks.make(*rows)
@@ -151,7 +160,7 @@ def backward(
         return state, jnp.matmul(share, affinity.target, precision=_HIGHEST)
 
     zero = jnp.zeros((), points.dtype)
-    per_block = (rows, jnp.moveaxis(u, 0, 1), jnp.moveaxis(b, 0, 1), pull, of_u)
+    per_block = (shifted, jnp.moveaxis(u, 0, 1), jnp.moveaxis(b, 0, 1), pull, of_u)
     (of_target, of_beta, of_alpha), of_source = lax.scan(
         spend, (jnp.zeros_like(affinity.target), zero, zero), per_block
     )
@@ -168,7 +177,7 @@ def backward(
 class _Blocks:
     """The block in pieces: rows of the source, cut and padded, made into affinities on demand."""
 
-    def __init__(self, affinity, masks, most_rows):
+    def __init__(self, affinity: Affinity, masks: tuple[Array, Array], most_rows: int) -> None:
         self.affinity, self.target_mask = affinity, masks[1]
         n = affinity.source.shape[0]
         self.count = -(-n // most_rows)
@@ -182,7 +191,7 @@ class _Blocks:
         padded = jnp.pad(values, pad, constant_values=fill)
         return padded.reshape(self.count, self.size, *values.shape[1:])
 
-    def make(self, rows, shift=None) -> tuple[Array, Array, Array]:
+    def make(self, rows: _Rows, shift: Array | None = None) -> tuple[Array, Array, Array]:
         """exp(log m - shift), the squared distances, and the shift of a block of rows."""
         features, mask = rows
         beta, alpha = self.affinity.beta, self.affinity.alpha

@@ -20,6 +20,7 @@ from cfr_jax.data.sources import ShapeSource
 from cfr_jax.training import devices, step
 from cfr_jax.training.config import TrainingConfig
 from cfr_jax.training.drawing import Leg, Stretch
+from cfr_jax.training.losses import PairLoss
 from cfr_jax.training.step import TrainState
 
 _TIMED = 2  # stretches that the speed is taken of
@@ -62,7 +63,7 @@ class DeviceDrawing:
             jax.block_until_ready(measured.total)
         return _TIMED * self._steps / (time.perf_counter() - began)
 
-    def _compiling(self, leg, steps, state):
+    def _compiling(self, leg: Leg, steps: int, state: TrainState) -> Future:
         known = leg.recipe, leg.sampling, leg.phase.batch, steps
         if known not in self._programs:
             lowered = step.train_on_drawn.lower(
@@ -77,7 +78,7 @@ class DeviceDrawing:
             thread.shutdown(wait=False)
         return self._programs[known]
 
-    def _places(self, batch, steps, position):
+    def _places(self, batch: int, steps: int, position: int) -> list[jax.Array]:
         """Rows of the corpus and places in the stream (steps, batch), over the devices."""
         share = devices.share_of(batch)
         items = items_at(len(self._rows), position, steps * batch, self._seed)
@@ -88,7 +89,9 @@ class DeviceDrawing:
         ]
 
 
-def _run(program, on_device, places, state):
+def _run(
+    program: jax.stages.Compiled, on_device: tuple, places: list[jax.Array], state: TrainState
+) -> tuple[TrainState, PairLoss]:
     return program(state, *on_device, *places)
 
 
@@ -115,5 +118,5 @@ def _shapes(mixture: Mixture) -> tuple[Shapes, np.ndarray]:
     return shapes, np.concatenate(rows)
 
 
-def _fields(shapes: Shapes):
+def _fields(shapes: Shapes) -> tuple[jax.Array | np.ndarray, jax.Array | np.ndarray]:
     return shapes.points, shapes.normals

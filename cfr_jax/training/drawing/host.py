@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 from jax.sharding import Mesh
 
 from cfr_jax.data.loader import batches
@@ -11,6 +12,7 @@ from cfr_jax.data.mixture import Mixture
 from cfr_jax.training import devices, step
 from cfr_jax.training.config import TrainingConfig
 from cfr_jax.training.drawing import Leg, Stretch
+from cfr_jax.training.losses import PairLoss
 from cfr_jax.training.step import TrainState
 
 
@@ -37,7 +39,9 @@ class HostDrawing:
         )
         for batch in stream:
 
-            def run(state, batch=batch):
+            def run(
+                state: TrainState, batch: dict[str, np.ndarray] = batch
+            ) -> tuple[TrainState, PairLoss]:
                 return step.train_step(state, devices.spread(batch, self._mesh), recipe=leg.recipe)
 
             yield Stretch(1, run)

@@ -89,11 +89,11 @@ class Board:
             with writing(self._folder):
                 self._events.close()
 
-    def _scalars(self, line, step):
+    def _scalars(self, line: dict[str, Any], step: int) -> None:
         for tag, value in scalars(line).items():
             self._add(step, summary=self._summary.scalar(tag, value))
 
-    def _add(self, step, **content):
+    def _add(self, step: int, **content: Any) -> None:
         self._events.write_event(self._event(step=step, wall_time=time.time(), **content))
 
 

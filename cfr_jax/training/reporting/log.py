@@ -42,11 +42,11 @@ class Clock:
         seconds, processor = self._total()
         return {"seconds": float(seconds), "processor_seconds": float(processor)}
 
-    def _total(self):
+    def _total(self) -> np.ndarray:
         return self._used if self._since is None else self._used + self._now() - self._since
 
     @staticmethod
-    def _now():
+    def _now() -> np.ndarray:
         return np.array([time.perf_counter(), time.process_time()])
 
 

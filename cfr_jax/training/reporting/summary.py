@@ -64,7 +64,7 @@ def _figure(chart: Chart) -> str:
         low, high = low - 0.5, high + 0.5
     first, last = min(steps), max(max(steps), min(steps) + 1)
 
-    def place(step, value):
+    def place(step: int, value: float) -> str:
         x = _LEFT + (step - first) / (last - first) * (_WIDTH - _LEFT - 10)
         y = _ABOVE + (high - value) / (high - low) * (_HEIGHT - _ABOVE - _BELOW)
         return f"{x:.1f},{y:.1f}"
@@ -96,9 +96,9 @@ def _figure(chart: Chart) -> str:
     )
 
 
-def _finite(value):
+def _finite(value: float) -> bool:
     return value == value and abs(value) != float("inf")
 
 
-def _number(value, unit):
+def _number(value: float | None, unit: str) -> str:
     return "–" if value is None else f"{value:.3g}{unit}"
