@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import IO, Literal
+from typing import IO, Literal, cast
 from urllib.parse import unquote
 
 from cfr_jax.runtime.atomic import unfinished
@@ -123,7 +123,9 @@ def _data_tar(deb: Path, quiet: bool) -> Iterator[tarfile.TarFile]:
                 unit="B",
                 unit_scale=True,
             ) as counted:
-                with tarfile.open(fileobj=counted, mode=_MODES[kind]) as tar:
+                # tqdm's stubs know of the counted method only; it hands on all others
+                whole = cast(IO[bytes], counted)
+                with tarfile.open(fileobj=whole, mode=_MODES[kind]) as tar:
                     yield tar
     except (OSError, EOFError, tarfile.TarError, lzma.LZMAError, zlib.error) as error:
         raise ValueError(f"{deb} is not a whole Debian package: {error}") from error
