@@ -93,7 +93,7 @@ def signature(plan: Plan) -> tuple:
 @jax.jit
 def encode_target(params: Mapping, target: solving.DeviceCloud) -> Encoded:
     """The target's side of `solving.solve`, for a cloud as `solving.on_device` hands it over."""
-    return encode(params, target.prepared(), settings=SETTINGS)
+    return encode(dict(params), target.prepared(), settings=SETTINGS)
 
 
 @functools.partial(jax.jit, static_argnames=("refine",))

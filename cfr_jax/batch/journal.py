@@ -13,11 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-try:
-    import fcntl
-except ImportError:  # Windows: whoever starts two of one name there has to know better
-    fcntl = None
-
 FORMAT = "cfr_jax/batch/1"
 Key = tuple[str, str, int]
 
@@ -97,7 +92,9 @@ class Journal:
             line = line[os.write(self._file, line) :]
 
     def _lock(self) -> None:
-        if fcntl is None:
+        try:
+            import fcntl
+        except ImportError:  # Windows: whoever starts two of one name there has to know better
             return
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -77,14 +77,14 @@ def align_many(
         batch = ON_CPU if jax.default_backend() == "cpu" else ON_ACCELERATOR
     if workers is None:
         workers = min(4, os.cpu_count() or 1)
-    params = checked_params(params)
+    weights = checked_params(params)
     refinement = find(refine)
     if refinement is not None and not refinement.traceable:
         raise ValueError(
             f"refine: got {refine!r}, which runs on the host; wanted True, False or one that JAX "
             "can trace. `align` takes any, pair by pair"
         )
-    device = Device(params, refinement, second_look, whole_number("batch", batch, least=1))
+    device = Device(weights, refinement, second_look, whole_number("batch", batch, least=1))
     workers = whole_number("workers", workers, least=1)
     done = _done(_Planner(budget, seed), pairs, device, workers)
     return _in_order(done) if ordered else done
@@ -94,7 +94,7 @@ class _Planner:
     """Pairs made ready, by many threads at once; targets that come again are not made again."""
 
     def __init__(self, budget: int, seed: int):
-        self._options = {"max_points": budget, "seed": seed}
+        self._budget, self._seed = budget, seed
         self._clouds, self._units = Memo(_TARGET_CLOUDS), Memo(_TARGET_UNITS)
 
     def __call__(self, pair: Any) -> Plan:
@@ -114,7 +114,14 @@ class _Planner:
             key = id(cloud), center.tobytes(), scale, motion.tobytes()
             return self._units.get(key, make)[1]
 
-        plan = planned(source, target, initial=initial, to_unit=to_unit, **self._options)
+        plan = planned(
+            source,
+            target,
+            initial=initial,
+            to_unit=to_unit,
+            max_points=self._budget,
+            seed=self._seed,
+        )
         if plan.starts is not None:
             raise ValueError(
                 "initial: got several starts, wanted one (4, 4); a search is for `align` alone"

@@ -8,6 +8,7 @@ network works.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -71,7 +72,7 @@ class Sampling:
     estimated_normals: float = 0.0
     """Share whose normals are estimated from the noisy points, as most users' are."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in _SHARES:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: got {getattr(self, name)}, wanted a share from 0 to 1")
@@ -153,7 +154,9 @@ def finish_pair(
     turned = np.eye(4)
     turned[:3, :3] = turn @ truth[:3, :3] @ turn.T
     turned[:3, 3] = scale * (turn @ truth[:3, 3])
-    pair = {"estimate_normals": estimate or source.normals is None or target.normals is None}
+    pair: dict[str, Any] = {
+        "estimate_normals": estimate or source.normals is None or target.normals is None
+    }
     moved = {}
     for side, view, placed in (("source", source, motion), ("target", target, np.eye(4))):
         rotation = placed[:3, :3] @ turn
@@ -174,7 +177,7 @@ def finish_pair(
     return pair | {"transform": truth.astype(np.float32)}
 
 
-def _motion(sampling, rng):
+def _motion(sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
     both_ways = rng.random() < sampling.both_ways
     factor = rng.random() if rng.random() < sampling.near else 1.0
     reach = factor * sampling.angle, factor * sampling.translation
@@ -225,6 +228,6 @@ def add_outliers(
     return points, normals
 
 
-def _direction(rng):
+def _direction(rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
     direction = rng.normal(size=3)
     return direction / np.linalg.norm(direction)

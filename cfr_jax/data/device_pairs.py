@@ -74,7 +74,7 @@ def draw_pairs(
     `positions[i]` of the stream, arrays (b, ...). `sampling` is static."""
     key = random.key(seed)
 
-    def one(item, position):
+    def one(item: Array, position: Array) -> dict:
         return draw_pair(
             shapes.points[item], shapes.normals[item], random.fold_in(key, position), sampling
         )
@@ -97,7 +97,7 @@ def draw_pair(
     of_pair, of_sides = random.split(key)
     drawn = _decide(of_pair, sampling)
 
-    def cloud(key, placed):
+    def cloud(key: Array, placed: Array) -> tuple[Array, Array, Array]:
         return _cloud(points, normals, placed, drawn, key, sampling)
 
     # both clouds in one go: half as many kernels
@@ -115,7 +115,7 @@ def draw_pair(
     return pair
 
 
-def _decide(key, sampling: Sampling) -> _Draw:
+def _decide(key: Key[Array, ""], sampling: Sampling) -> _Draw:
     of_flags, of_turn, of_scale, of_motion = random.split(key, 4)
     shares = ("any_orientation", "uneven", "centered", "sensor_noise", "estimated_normals")
     limits = jnp.array([getattr(sampling, name) for name in shares])
@@ -134,7 +134,7 @@ def _decide(key, sampling: Sampling) -> _Draw:
     )
 
 
-def _motion(key, sampling: Sampling):
+def _motion(key: Key[Array, ""], sampling: Sampling) -> Float[Array, "4 4"]:
     of_flags, of_angles, of_shift = random.split(key, 3)
     both_ways, near, factor = random.uniform(of_flags, (3,))
     factor = jnp.where(near < sampling.near, factor, 1)
@@ -154,7 +154,14 @@ def _motion(key, sampling: Sampling):
     return rigid.from_parts(rotation, factor * np.float32(sampling.translation) * shift)
 
 
-def _cloud(points, normals, placed, drawn: _Draw, key, sampling: Sampling):
+def _cloud(
+    points: Float[Array, "p 3"],
+    normals: Float[Array, "p 3"],
+    placed: Float[Array, "4 4"],
+    drawn: _Draw,
+    key: Key[Array, ""],
+    sampling: Sampling,
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, " 3"]]:
     """Points and normals of one side, and what was taken off to center it."""
     of_rows, of_noise, of_outliers = random.split(key, 3)
     rows = _rows(points, drawn.uneven, of_rows, sampling)
@@ -172,7 +179,9 @@ def _cloud(points, normals, placed, drawn: _Draw, key, sampling: Sampling):
     return x - middle, n, middle
 
 
-def _rows(points, uneven, key, sampling: Sampling):
+def _rows(
+    points: Float[Array, "p 3"], uneven: Bool[Array, ""], key: Key[Array, ""], sampling: Sampling
+) -> Int32[Array, " n"]:
     """Rows of one cloud: a crop, and of what it leaves `sampling.points`, as `augment.choose_rows`
     draws them. Where it leaves too few, all of them, and some again."""
     of_keep, of_plane, of_side, of_scores, of_more = random.split(key, 5)
@@ -201,7 +210,9 @@ def _rows(points, uneven, key, sampling: Sampling):
     return order[jnp.where(place < left, place, jnp.minimum(again, left - 1))]
 
 
-def _crop(points, keep, key):
+def _crop(
+    points: Float[Array, "p 3"], keep: Float[Array, ""], key: Key[Array, ""]
+) -> Bool[Array, " p"]:
     """Which points lie beyond a plane with a random normal that leaves a share of `keep`, as
     `protocol.crop` has it."""
     count = points.shape[0]
@@ -213,13 +224,17 @@ def _crop(points, keep, key):
     return height > jnp.where(keep == 0.5, 0, plane)
 
 
-def _add_noise(x, key, sampling: Sampling):
+def _add_noise(
+    x: Float[Array, "n 3"], key: Key[Array, ""], sampling: Sampling
+) -> Float[Array, "n 3"]:
     of_scale, of_each = random.split(key)
     scale = _between(of_scale, sampling.noise)
     return x + scale * jnp.clip(random.normal(of_each, x.shape), -_MOST, _MOST)
 
 
-def _add_sensor_noise(x, key, sampling: Sampling):
+def _add_sensor_noise(
+    x: Float[Array, "n 3"], key: Key[Array, ""], sampling: Sampling
+) -> Float[Array, "n 3"]:
     of_away, of_side, of_scale, of_each = random.split(key, 4)
     away = _between(of_away, SENSOR_AWAY)
     ray = x - (jnp.mean(x, axis=0) + away * _directions(of_side, 1))
@@ -229,7 +244,9 @@ def _add_sensor_noise(x, key, sampling: Sampling):
     return x + ray / distance * error * scale * (distance / away) ** 2
 
 
-def _add_outliers(x, n, key, sampling: Sampling):
+def _add_outliers(
+    x: Float[Array, "n 3"], n: Float[Array, "n 3"], key: Key[Array, ""], sampling: Sampling
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
     of_share, of_rows, of_radius, of_place, of_normal = random.split(key, 5)
     count = x.shape[0]
     share = _between(of_share, sampling.outliers)
@@ -242,15 +259,15 @@ def _add_outliers(x, n, key, sampling: Sampling):
     return jnp.where(out, placed, x), jnp.where(out, _directions(of_normal, count), n)
 
 
-def _between(key, limits):
+def _between(key: Key[Array, ""], limits: tuple[float, float]) -> Float[Array, ""]:
     return random.uniform(key, minval=limits[0], maxval=limits[1])
 
 
-def _heights(points, key):
+def _heights(points: Float[Array, "p 3"], key: Key[Array, ""]) -> Float[Array, " p"]:
     """Along a random direction; summed in float32, which a product on a GPU would not be."""
     return jnp.sum(points * _directions(key, 1), axis=1)
 
 
-def _directions(key, count):
+def _directions(key: Key[Array, ""], count: int) -> Float[Array, "n 3"]:
     drawn = random.normal(key, (count, 3))
     return drawn / jnp.sqrt(jnp.sum(drawn * drawn, axis=1, keepdims=True))

@@ -50,7 +50,7 @@ def items_at(count: int, position: int, size: int, seed: int) -> Int[np.ndarray,
 
 
 @functools.lru_cache(4)
-def _order(count, seed, epoch):
+def _order(count: int, seed: int, epoch: int) -> np.ndarray:
     return np.random.default_rng((seed, epoch)).permutation(count)
 
 

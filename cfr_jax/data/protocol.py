@@ -40,7 +40,7 @@ class Protocol:
     both_ways: bool = False  # each angle from [-angle, angle] instead, as users' clouds may be
     translation: float = 0.5  # each coordinate is drawn from [-translation, translation]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.points < 1:
             raise ValueError(f"points is {self.points}, wanted at least 1")
         if self.keep is not None and not 0 < self.keep < 1:

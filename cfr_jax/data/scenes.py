@@ -103,7 +103,7 @@ class SceneSource:
         ):
             kept = crop(points, rng.uniform(*sampling.keep), rng)
             clouds.append(io.PointCloud(points[kept], None if normals is None else normals[kept]))
-        frames = units.unit_frames(*clouds, None)
+        frames = units.unit_frames(clouds[0], clouds[1], None)
         centers = frames.source_center, frames.target_center
         views = [
             _view(cloud, center, frames.scale, sampling, uneven, rng)
@@ -112,7 +112,7 @@ class SceneSource:
         truth = np.array(pair.transform, np.float64)
         truth[:3, 3] += truth[:3, :3] @ frames.source_center - frames.target_center
         truth[:3, 3] /= frames.scale
-        return finish_pair(*views, truth, sampling, rng)
+        return finish_pair(views[0], views[1], truth, sampling, rng)
 
 
 def scene_source(
@@ -150,7 +150,9 @@ def scene_source(
     return SceneSource(tuple(names), tuple(frames), held, stamp, single)
 
 
-def _held(where, points, normals):
+def _held(
+    where: object, points: np.ndarray, normals: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray | None]:
     """What is kept in memory of a scan; raises ValueError for one that teaches nothing."""
     few = points[:: max(1, len(points) // 256)]  # enough to see whether all lie in one place
     if len(np.unique(few, axis=0)) < _FEWEST:

@@ -85,7 +85,7 @@ class ShapeSource:
             kept = protocol.crop(points, rng.uniform(*sampling.keep), rng)
             rows = kept[choose_rows(points[kept], sampling, uneven, rng)]
             views.append(View(points[rows], normals[rows]))
-        return finish_pair(*views, np.eye(4), sampling, rng)
+        return finish_pair(views[0], views[1], np.eye(4), sampling, rng)
 
     def fixed_pair(
         self,

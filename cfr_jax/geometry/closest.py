@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
+from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
 
 _ENTRIES = 1 << 20  # ranks held at a time on a CPU: they stay in a core's cache
 
 
-class Closest(NamedTuple):
+@struct.dataclass
+class Closest:
     """For each query the closest point of a cloud, and its squared distance."""
 
     index: Int32[Array, " n"]
@@ -37,7 +37,9 @@ def closest(
     return Closest(index, jnp.sum(offset * offset, axis=1))
 
 
-def _closest_by_product(queries, points, mask):
+def _closest_by_product(
+    queries: Float[Array, "n 3"], points: Float[Array, "m 3"], mask: Bool[Array, " m"] | None
+) -> Int32[Array, " n"]:
     """On a CPU |y|^2 - 2 x y ranks the points with one matrix product. Its cancellation can only
     confuse points that lie within float32's rounding of each other."""
     norms = jnp.sum(points * points, axis=1)
@@ -48,7 +50,7 @@ def _closest_by_product(queries, points, mask):
     blocks = -(-queries.shape[0] // rows)
     padded = jnp.pad(queries, ((0, blocks * rows - queries.shape[0]), (0, 0)))
 
-    def block(here):
+    def block(here: Array) -> Array:
         rank = norms - 2 * jnp.matmul(here, points.T, precision=lax.Precision.HIGHEST)
         # two plain reductions: XLA's argmin on CPU is not vectorized
         best = jnp.min(rank, axis=1, keepdims=True)
@@ -57,7 +59,9 @@ def _closest_by_product(queries, points, mask):
     return lax.map(block, padded.reshape(blocks, rows, 3)).reshape(-1)[: queries.shape[0]]
 
 
-def _closest_by_differences(queries, points, mask):
+def _closest_by_differences(
+    queries: Float[Array, "n 3"], points: Float[Array, "m 3"], mask: Bool[Array, " m"] | None
+) -> Int32[Array, " n"]:
     """On an accelerator the distances are made inside the reduction: one kernel, nothing stored."""
     square = squares(queries[:, None], far_where_masked(points, mask))
     return lax.argmin(square, 1, jnp.int32)

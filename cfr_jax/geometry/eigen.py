@@ -25,6 +25,7 @@ SWEEPS = 5
 # has a meaning in float32.
 SQUARINGS = 20
 _HIGHEST = lax.Precision.HIGHEST
+_Entries = dict[tuple[int, int], Array]
 
 
 @functools.partial(jax.jit, static_argnames=("sweeps",))  # so that its many scalars are traced once
@@ -77,7 +78,7 @@ def solve_positive(matrix: Float[Array, "d d"], right: Float[Array, " d"]) -> Fl
     return _repeated(_eliminate, len(matrix), rows)[:, -1]
 
 
-def _eliminate(k, rows):
+def _eliminate(k: Array | int, rows: Float[Array, "d e"]) -> Float[Array, "d e"]:
     pivot = rows[k] / rows[k, k]
     column = lax.dynamic_slice_in_dim(rows, k, 1, axis=1)
     own = jnp.arange(len(rows))[:, None] == k
@@ -88,10 +89,10 @@ def _repeated(step: Callable[[Any, Any], Any], count: int, state: Any) -> Any:
     """`step(i, state)` for i below `count`. Accelerators get it written out: in a loop, each number
     that is carried would be copied by a kernel of its own. On a CPU a loop compiles faster."""
 
-    def looped(state):
+    def looped(state: Any) -> Any:
         return lax.fori_loop(0, count, step, state)
 
-    def written_out(state):
+    def written_out(state: Any) -> Any:
         for i in range(count):
             state = step(i, state)
         return state
@@ -100,13 +101,13 @@ def _repeated(step: Callable[[Any, Any], Any], count: int, state: Any) -> Any:
 
 
 @jax.jit
-def _squared(_, power):
+def _squared(_: Any, power: Float[Array, "d d"]) -> Float[Array, "d d"]:
     square = jnp.sum(power[:, :, None] * power[None, :, :], axis=1)
     return square / jnp.trace(square)
 
 
 @jax.jit
-def _sweep(_, state):
+def _sweep(_: Any, state: tuple[_Entries, _Entries]) -> tuple[_Entries, _Entries]:
     entries, vectors = state
     d = max(row for row, _ in vectors) + 1
     for p in range(d):
@@ -115,7 +116,9 @@ def _sweep(_, state):
     return entries, vectors
 
 
-def _turn(entries, vectors, p, q, d):
+def _turn(
+    entries: _Entries, vectors: _Entries, p: int, q: int, d: int
+) -> tuple[_Entries, _Entries]:
     """One Jacobi rotation, which makes entry (p, q) zero."""
     off, gap = entries[p, q], entries[q, q] - entries[p, p]
     # tan of the smaller angle with tan(2 angle) = 2 off / gap
@@ -150,7 +153,7 @@ def least_direction(covariance: Float[Array, "3 3"]) -> Float[Array, " 3"]:
 
 
 @least_direction.defjvp
-def _least_direction_jvp(primals, tangents):
+def _least_direction_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     (covariance,), (tangent,) = primals, tangents
     scaled, scale = _unit_scale(covariance)
     values, vectors = symmetric_eigen(scaled)
@@ -163,7 +166,7 @@ def _least_direction_jvp(primals, tangents):
     return least, -jnp.matmul(vectors, pull, precision=_HIGHEST)
 
 
-def _unit_scale(matrix):
+def _unit_scale(matrix: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Float[Array, ""]]:
     largest = jnp.max(jnp.abs(matrix))
     scale = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
     return matrix / scale, scale

@@ -56,11 +56,13 @@ def nearest(
     )
 
 
-def _nearest_by_bits(points, mask, k, limit):
+def _nearest_by_bits(
+    points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None, k: int, limit: float
+) -> Int32[Array, "n k"]:
     """`nearest` as a CPU does it."""
     n = points.shape[0]
 
-    def choose(row, square):
+    def choose(row: Array, square: Array) -> Array:
         if mask is not None:
             square = jnp.where(mask, square, jnp.inf)
         square = jnp.where(row == jnp.arange(n), jnp.inf, square)
@@ -73,10 +75,12 @@ def _nearest_by_bits(points, mask, k, limit):
     return _by_rows(points, choose)
 
 
-def _nearest_by_groups(points, mask, k, limit, **sizes):
+def _nearest_by_groups(
+    points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None, k: int, limit: float, **sizes: int
+) -> Int32[Array, "n k"]:
     """`nearest` as an accelerator does it: a handful of kernels."""
 
-    def square_of(row, query, column, point):
+    def square_of(row: Array, query: Array, column: Array, point: Array) -> Array:
         return jnp.where(row == column, jnp.inf, squares(query, point))
 
     square, chosen = k_smallest_of_groups(
@@ -101,8 +105,10 @@ def first_in_ball(
     )
 
 
-def _first_by_bits(points, mask, k, radius):
-    def choose(row, square):
+def _first_by_bits(
+    points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None, k: int, radius: float
+) -> Int32[Array, "n k"]:
+    def choose(row: Array, square: Array) -> Array:
         inside = (square <= radius * radius) & (row != jnp.arange(points.shape[0]))
         if mask is not None:
             inside &= mask
@@ -113,8 +119,10 @@ def _first_by_bits(points, mask, k, radius):
     return _by_rows(points, choose)
 
 
-def _first_by_groups(points, mask, k, radius, **sizes):
-    def place_of(row, query, column, point):
+def _first_by_groups(
+    points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None, k: int, radius: float, **sizes: int
+) -> Int32[Array, "n k"]:
+    def place_of(row: Array, query: Array, column: Array, point: Array) -> Array:
         inside = (squares(query, point) <= radius * radius) & (row != column)
         return jnp.where(inside, column.astype(query.dtype), jnp.inf)
 
@@ -126,7 +134,9 @@ def _first_by_groups(points, mask, k, radius, **sizes):
     return jnp.concatenate([jnp.where(place < jnp.inf, found, row), missing], axis=1)
 
 
-def _by_rows(points, choose: Callable):
+def _by_rows(
+    points: Float[Array, "n 3"], choose: Callable[[Array, Array], Array]
+) -> Int32[Array, "n k"]:
     """`choose(row, square)` for blocks of rows: their numbers (r, 1) and their squared distances to
     all points (r, n) in, their neighbors (r, k) out; all rows (n, k) back."""
     n = points.shape[0]
@@ -134,7 +144,7 @@ def _by_rows(points, choose: Callable):
     blocks = -(-n // rows)
     queries = jnp.pad(points, ((0, blocks * rows - n), (0, 0)))
 
-    def block(start):
+    def block(start: Array) -> Array:
         here = lax.dynamic_slice_in_dim(queries, start, rows)
         square = squares(here[:, None], points)
         return choose((start + jnp.arange(rows, dtype=jnp.int32))[:, None], square)
@@ -168,19 +178,20 @@ def nearest_on_host(
     return found
 
 
-def _among_all(points, k):
+def _among_all(points: np.ndarray, k: int) -> np.ndarray:
     """Keys of the k nearest other points of each point, by comparing all."""
     n = len(points)
     columns, index = np.ascontiguousarray(points.T), np.arange(n)
     blocks = []
     for rows in np.array_split(index, -(-n // _HOST_ROWS)):
-        square = sum((axis[rows, None] - axis) ** 2 for axis in columns)
+        x, y, z = ((axis[rows, None] - axis) ** 2 for axis in columns)
+        square = x + y + z
         square[np.arange(len(rows)), rows] = np.inf
         blocks.append(_smallest(square, index, k))
     return np.concatenate(blocks)
 
 
-def _in_tree(points, k, workers):
+def _in_tree(points: np.ndarray, k: int, workers: int) -> np.ndarray:
     """The same by a KD-tree, some rows at a time: what it finds is many times what is kept."""
     n = len(points)
     # imported here: a fifth of a second that small clouds need not wait for
@@ -202,7 +213,7 @@ def _in_tree(points, k, workers):
     return keys
 
 
-def _smallest(square, index, k):
+def _smallest(square: np.ndarray, index: np.ndarray, k: int) -> np.ndarray:
     """Keys of each row's k smallest distances, in no order.
 
     A key is the distance's bits, monotonic as none is negative, above the point's index: ties fall
@@ -213,5 +224,5 @@ def _smallest(square, index, k):
     return keys[:, :k].copy()
 
 
-def _square_of(keys):
+def _square_of(keys: np.ndarray) -> np.ndarray:
     return (keys >> 32).astype(np.int32).view(np.float32)

@@ -108,7 +108,7 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
 
 
 @nearest_rotation.defjvp
-def _nearest_rotation_jvp(primals, tangents):
+def _nearest_rotation_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     (matrix,), (tangent,) = primals, tangents
     rotation = nearest_rotation(matrix)
     stretch = jnp.matmul(rotation.T, matrix, precision=_HIGHEST)
@@ -145,7 +145,7 @@ def skew(vector: Float[Array, " 3"]) -> Float[Array, "3 3"]:
     return jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
 
 
-def _vee(matrix):
+def _vee(matrix: Float[Array, "3 3"]) -> Float[Array, " 3"]:
     return jnp.array([matrix[2, 1], matrix[0, 2], matrix[1, 0]])
 
 

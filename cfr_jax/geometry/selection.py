@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
@@ -25,7 +26,7 @@ def k_smallest(values: Float[Array, "r n"], k: int) -> Int32[Array, "r k"]:
     n = values.shape[1]
     bits = lax.bitcast_convert_type(values, jnp.int32)  # monotonic, as no value is negative
 
-    def halve(_, bounds):
+    def halve(_: Any, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds
         middle = low + (high - low) // 2
         enough = jnp.sum(bits <= middle[:, None], axis=1) >= k
@@ -70,7 +71,7 @@ def k_smallest_of_groups(
     points = jnp.pad(points, ((0, count * size - m), (0, 0)), constant_values=jnp.inf)
     columns = jnp.arange(count * size, dtype=jnp.int32)
 
-    def of_rows(row, query):
+    def of_rows(row: Array, query: Array) -> tuple[Array, Array]:
         row, query = row[:, None], query[:, None]
         values = value_of(row, query, columns[None], points[None])
         if size == 1:

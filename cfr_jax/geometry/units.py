@@ -135,8 +135,16 @@ def thinned(unit: UnitCloud, *, budget: int, neighbors: int, radius: float, seed
     """At most `budget` points of a unit cloud, where they lie; its `rows` are those of `unit`."""
     normals = None if unit.normals is None else unit.normals[unit.mask].astype(np.float64)
     cloud = PointCloud(unit.points[unit.mask].astype(np.float64), normals)
-    options = {"budget": budget, "neighbors": neighbors, "radius": radius, "seed": seed}
-    return to_unit(cloud, np.zeros(3), 1.0, np.eye(4), **options)
+    return to_unit(
+        cloud,
+        np.zeros(3),
+        1.0,
+        np.eye(4),
+        budget=budget,
+        neighbors=neighbors,
+        radius=radius,
+        seed=seed,
+    )
 
 
 def subsample(points: Float[np.ndarray, "n 3"], budget: int, seed: int) -> Int[np.ndarray, " m"]:
@@ -173,7 +181,7 @@ def bucket(count: int) -> int:
     return next((size for size in _BUCKETS if size >= count), count)
 
 
-def _ball(name, points):
+def _ball(name: str, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
     """Center and radius of all but the stray points; far ones would pull a plain mean away."""
     center = points.mean(axis=0)
     away = np.linalg.norm(points - center, axis=1)
@@ -187,7 +195,7 @@ def _ball(name, points):
     return center, radius
 
 
-def _first_of_each_voxel(points, voxel):
+def _first_of_each_voxel(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray, " m"]:
     # the middle of a voxel lies at zero, as coordinates of flat and symmetric clouds often do:
     # a border there would let rounding decide
     cells = np.floor(points / voxel + 0.5).astype(np.int64)

@@ -66,7 +66,8 @@ def from_structured(array: np.ndarray, name: str) -> PointCloud:
     in `left_out`.
     """
     flat = array.reshape(-1)
-    return cloud_of_filled(*_columns(array.dtype.names, lambda column: flat[column]), name)
+    points, normals = _columns(array.dtype.names, lambda column: flat[column])
+    return cloud_of_filled(points, normals, name)
 
 
 def from_data_frame(frame: Any, name: str) -> PointCloud | None:
@@ -79,7 +80,9 @@ def from_data_frame(frame: Any, name: str) -> PointCloud | None:
     return PointCloud(points, None if normals is None else usable_normals(normals), name)
 
 
-def _columns(names: Iterable[str] | None, column: Callable[[str], np.ndarray]):
+def _columns(
+    names: Iterable[str] | None, column: Callable[[str], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Points (n, 3), and normals (n, 3) or None, from the columns of these names."""
     names = set(names or ())
     missing = [axis for axis in _POINT if axis not in names]
@@ -88,12 +91,11 @@ def _columns(names: Iterable[str] | None, column: Callable[[str], np.ndarray]):
             f"has no {' and no '.join(missing)} among {', '.join(sorted(names)) or 'no columns'}"
         )
     normals = next((triple for triple in _NORMALS if set(triple) <= names), None)
-    return tuple(
-        None
-        if triple is None
-        else np.stack([np.asarray(column(axis), np.float64) for axis in triple], axis=1)
-        for triple in (_POINT, normals)
-    )
+
+    def stacked(triple: Iterable[str]) -> np.ndarray:
+        return np.stack([np.asarray(column(axis), np.float64) for axis in triple], axis=1)
+
+    return stacked(_POINT), None if normals is None else stacked(normals)
 
 
 def _numbers(values: np.ndarray) -> np.ndarray:

@@ -45,17 +45,17 @@ def verify(folder: Path) -> None:
             raise Damaged(f"{folder / name} is damaged: its SHA-256 is not what was written")
 
 
-def _files(folder):
+def _files(folder: Path) -> dict[str, str]:
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != NAME)
     return {path.relative_to(folder).as_posix(): _digest(path) for path in paths}
 
 
-def _digest(path):
+def _digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _text(files):
+def _text(files: dict) -> bytes:
     listed = json.dumps(files, indent=1, sort_keys=True)
     whole = {"files": files, "sha256": hashlib.sha256(listed.encode()).hexdigest()}
     return (json.dumps(whole, indent=1, sort_keys=True) + "\n").encode()

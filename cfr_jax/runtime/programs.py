@@ -67,7 +67,12 @@ def compiled(function: Callable, *arguments: Any, **static: Any) -> Callable:
 
 
 @functools.lru_cache(maxsize=64)
-def _program(function, static, structure, shapes):
+def _program(
+    function: Any,
+    static: tuple[tuple[str, Any], ...],
+    structure: jax.tree_util.PyTreeDef,
+    shapes: tuple[tuple[tuple[int, ...], Any], ...],
+) -> jax.stages.Compiled:
     arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
     # two lambdas have one name, and so have functions among the options whose code may change
     if _places and "<" not in f"{function.__qualname__}{static}":
@@ -81,7 +86,7 @@ def _program(function, static, structure, shapes):
     return function.lower(*arguments, **dict(static)).compile()
 
 
-def _read(path):
+def _read(path: Path) -> jax_export.Exported | None:
     """The program kept at `path`; None where there is none, or not the one that was written."""
     try:
         content = path.read_bytes()
@@ -95,7 +100,7 @@ def _read(path):
     return jax_export.deserialize(bytearray(content))
 
 
-def _keep(path, exported):
+def _keep(path: Path, exported: jax_export.Exported) -> None:
     """Writes the program to `path`, if there is room, and it is made of what is `storable`."""
     try:
         content = exported.serialize()
@@ -107,7 +112,7 @@ def _keep(path, exported):
         write_atomically(path, hashlib.sha256(content).digest() + content)
 
 
-def _throw_away_unused(folder):
+def _throw_away_unused(folder: Path) -> None:
     for path in folder.glob(f"programs-{24 * '[0-9a-f]'}/*-{24 * '[0-9a-f]'}.stablehlo*"):
         with contextlib.suppress(OSError):
             if time.time() - path.stat().st_mtime > _UNUSED:

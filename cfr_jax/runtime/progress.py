@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sized
 from typing import Any
 
 from tqdm import tqdm
@@ -50,4 +51,4 @@ def _total(args: tuple, options: dict[str, Any]) -> int | None:
     if options.get("total") is not None:
         return options["total"]
     iterable = args[0] if args else options.get("iterable")
-    return len(iterable) if hasattr(iterable, "__len__") else None
+    return len(iterable) if isinstance(iterable, Sized) else None

@@ -9,9 +9,10 @@ a batch in turn takes three quarters of the time. Accelerators take it side by s
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
-from jax import lax
+from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
 
@@ -20,24 +21,26 @@ def cloud_by_cloud(on_cpu: Callable, elsewhere: Callable) -> Callable:
     the same result, for CPUs and for the rest."""
 
     @custom_vmap
-    def mapped(*arguments):
+    def mapped(*arguments: Any) -> Any:
         return lax.platform_dependent(*arguments, cpu=on_cpu, default=elsewhere)
 
     @mapped.def_vmap
-    def batch(size, batched, *arguments):
+    def batch(size: int, batched: Any, *arguments: Any) -> tuple[Any, Any]:
         axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
         leaves, structure = jax.tree.flatten(arguments)
         flags = jax.tree.leaves(batched)
 
-        def in_turn(*leaves):
-            def one(own):
-                own = iter(own)
-                every = [next(own) if b else leaf for leaf, b in zip(leaves, flags, strict=True)]
+        def in_turn(*leaves: Array) -> Any:
+            def one(own: list[Array]) -> Any:
+                mapped_over = iter(own)
+                every = [
+                    next(mapped_over) if b else leaf for leaf, b in zip(leaves, flags, strict=True)
+                ]
                 return on_cpu(*jax.tree.unflatten(structure, every))
 
             return lax.map(one, [leaf for leaf, b in zip(leaves, flags, strict=True) if b])
 
-        def side_by_side(*leaves):
+        def side_by_side(*leaves: Array) -> Any:
             return jax.vmap(elsewhere, in_axes=axes)(*jax.tree.unflatten(structure, leaves))
 
         found = lax.platform_dependent(*leaves, cpu=in_turn, default=side_by_side)

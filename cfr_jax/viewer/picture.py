@@ -74,8 +74,9 @@ def write_picture(path: str | os.PathLike[str], scene: Scene) -> None:
     _write_legend(figure, scene, y=1 - 0.32 / total)
     for row, (text, color) in enumerate(lines):
         height_of_line = (below - LINE * (row + 1)) / total
-        style = {"ha": "center", "color": color, "fontsize": 10.5, "parse_math": False}
-        figure.text(0.5, height_of_line, text, **style)
+        figure.text(
+            0.5, height_of_line, text, ha="center", color=color, fontsize=10.5, parse_math=False
+        )
 
     png = io.BytesIO()
     with warnings.catch_warnings():
@@ -127,7 +128,8 @@ def _draw_clouds(
         points[order, 1],
         s=diameter**2,
         c=colors[order],
-        edgecolors=0.72 * colors[order],  # a thin rim keeps neighbors apart
+        # a thin rim keeps neighbors apart; matplotlib takes an (n, 3) array, its stubs do not
+        edgecolors=0.72 * colors[order],  # type: ignore[arg-type]
         linewidths=0.08 * diameter,
     )
     axes.set_axis_off()
@@ -143,7 +145,10 @@ def _write_legend(figure: "Figure", scene: Scene, y: float) -> None:
     ):
         shown = role if name == role else f"{role}: {_shortened(_printable(name))}"
         label = f"{shown} ({count:,} points)"
-        handles.append(Line2D([], [], ls="", marker="o", ms=9, color=color, label=label))
+        red, green, blue = color
+        handles.append(
+            Line2D([], [], ls="", marker="o", ms=9, color=(red, green, blue), label=label)
+        )
     legend = figure.legend(
         handles=handles,
         loc="center",

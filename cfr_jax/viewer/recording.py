@@ -30,7 +30,7 @@ def write_recording(path: str | os.PathLike[str], scene: Scene) -> None:
             'recordings need rerun: pip install "cfr_jax[rerun]"', name="rerun"
         ) from error
 
-    def points(positions, color):
+    def points(positions: np.ndarray, color: np.ndarray) -> rr.Points3D:
         return rr.Points3D(
             positions.astype(np.float32),
             colors=np.rint(255 * color).astype(np.uint8),
@@ -54,7 +54,7 @@ def write_recording(path: str | os.PathLike[str], scene: Scene) -> None:
         stream.disconnect()
 
 
-def _text(scene, center):
+def _text(scene: Scene, center: np.ndarray) -> str:
     lines = [f"source: {scene.source_name}", f"target: {scene.target_name}"]
     lines += [f"{name}: {text}" for name, text in scene.facts.items()]
     lines += [f"warning: {text}" for text in scene.warnings]

@@ -1,7 +1,7 @@
 """What a picture of one registration shows: two clouds, the stations of the motion, the facts."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from cfr_jax.geometry import motions
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Scene:
     """One registration, ready to be drawn; every array is copied to read-only float64.
 
@@ -30,33 +30,46 @@ class Scene:
     or facts that are not text yet.
     """
 
-    # Typed as what may be given; what is kept is float64 and tuples.
-    source: ArrayLike
-    target: ArrayLike
-    transforms: ArrayLike
-    labels: Sequence[str]
-    weights: ArrayLike | None = None
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    source_name: str = "source"
-    target_name: str = "target"
-    warnings: Sequence[str] = ()
+    source: Float64[np.ndarray, "n 3"]
+    target: Float64[np.ndarray, "m 3"]
+    transforms: Float64[np.ndarray, "s 4 4"]
+    labels: tuple[str, ...]
+    weights: Float64[np.ndarray, " n"] | None
+    facts: Mapping[str, str]
+    source_name: str
+    target_name: str
+    warnings: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        source = _cloud("source", self.source)
-        transforms = _stations(self.transforms)
+    # Written out, as it takes anything like an array.
+    def __init__(
+        self,
+        source: ArrayLike,
+        target: ArrayLike,
+        transforms: ArrayLike,
+        labels: Sequence[str],
+        weights: ArrayLike | None = None,
+        facts: Mapping[str, Any] = MappingProxyType({}),
+        source_name: str = "source",
+        target_name: str = "target",
+        warnings: Sequence[str] = (),
+    ) -> None:
+        cloud = _cloud("source", source)
+        stations = _stations(transforms)
+        names = _texts("labels", labels)
         checked = {
-            "source": source,
-            "target": _cloud("target", self.target),
-            "transforms": transforms,
-            "labels": _texts("labels", self.labels),
-            "weights": None if self.weights is None else _weights(self.weights, len(source)),
-            "facts": _facts(self.facts),
-            "warnings": _texts("warnings", self.warnings),
+            "source": cloud,
+            "target": _cloud("target", target),
+            "transforms": stations,
+            "labels": names,
+            "weights": None if weights is None else _weights(weights, len(cloud)),
+            "facts": _facts(facts),
+            "source_name": source_name,
+            "target_name": target_name,
+            "warnings": _texts("warnings", warnings),
         }
-        if len(checked["labels"]) != len(transforms):
+        if len(names) != len(stations):
             raise ValueError(
-                f"labels: got {len(checked['labels'])} for {len(transforms)} transforms, "
-                "wanted one per transform"
+                f"labels: got {len(names)} for {len(stations)} transforms, wanted one per transform"
             )
         for name, value in checked.items():
             object.__setattr__(self, name, value)

@@ -52,8 +52,8 @@ def train(
 
     def read(row: int) -> Pair:
         sequence, a, b, transform = items[row]
-        clouds = [kitti.read_frame(path, sequence, frame) for frame in (a, b)]
-        return Pair(f"{sequence}/{a:06d}-{b:06d}", *clouds, transform=transform)
+        source, target = (kitti.read_frame(path, sequence, frame) for frame in (a, b))
+        return Pair(f"{sequence}/{a:06d}-{b:06d}", source, target, transform=transform)
 
     where = str(Path(path).resolve())
     return scene_source(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -129,7 +129,7 @@ def build(
             kept.append(item)
             shapes.append(made)
 
-    def bar(pairs):
+    def bar(pairs: Sequence[tuple[int, int]]) -> Iterable[tuple[int, int]]:
         return Progress(pairs, desc="comparing", unit=" pairs", disable=quiet)
 
     repeats = drop_duplicates(shapes, [item.category not in held_back for item in kept], bar)

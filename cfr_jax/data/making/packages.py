@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import IO
+from typing import IO, Literal, cast
 from urllib.parse import unquote
 
 from cfr_jax.runtime.atomic import unfinished
@@ -94,21 +94,38 @@ def extract(
     return written
 
 
+# "r|": one pass over the stream, which ends at the tar's own end mark.
+_MODES: dict[str, Literal["r|", "r|gz", "r|bz2", "r|xz"]] = {
+    "": "r|",
+    "gz": "r|gz",
+    "bz2": "r|bz2",
+    "xz": "r|xz",
+}
+
+
 @contextmanager
 def _data_tar(deb: Path, quiet: bool) -> Iterator[tarfile.TarFile]:
     try:
         with open(deb, "rb") as stream:
             name = _seek_data(stream, deb)
             kind = name.removeprefix("data.tar").removeprefix(".")
-            if kind not in ("", "gz", "bz2", "xz"):
+            if kind not in _MODES:
                 raise ValueError(
                     f"{deb}: {name} is packed in a way that Python 3.11 cannot read; repack it "
                     "with `dpkg-deb`, or take the package of Debian 12"
                 )
-            bar = {"total": deb.stat().st_size, "disable": quiet, "unit": "B", "unit_scale": True}
-            with Progress.wrapattr(stream, "read", desc=deb.name.split("_")[0], **bar) as counted:
-                # "r|": one pass over the stream, which ends at the tar's own end mark.
-                with tarfile.open(fileobj=counted, mode=f"r|{kind}") as tar:
+            with Progress.wrapattr(
+                stream,
+                "read",
+                total=deb.stat().st_size,
+                desc=deb.name.split("_")[0],
+                disable=quiet,
+                unit="B",
+                unit_scale=True,
+            ) as counted:
+                # tqdm's stubs know of the counted method only; it hands on all others
+                whole = cast(IO[bytes], counted)
+                with tarfile.open(fileobj=whole, mode=_MODES[kind]) as tar:
                     yield tar
     except (OSError, EOFError, tarfile.TarError, lzma.LZMAError, zlib.error) as error:
         raise ValueError(f"{deb} is not a whole Debian package: {error}") from error

@@ -73,7 +73,7 @@ def parse_npz(data: bytes, name: str) -> PointCloud:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            chosen = [key for key in ("points", "normals") if key in members]
+            chosen: list[str] = [key for key in ("points", "normals") if key in members]
             if "points" not in chosen:
                 if len(members) != 1:
                     held = ", ".join(map(repr, sorted(members)[:8])) or "nothing"
@@ -120,7 +120,7 @@ def save_npy(stream: BinaryIO, cloud: PointCloud) -> None:
 
 def save_npz(stream: BinaryIO, cloud: PointCloud) -> None:
     """The float64 arrays `points` and, if there are any, `normals`."""
-    arrays = {"points": cloud.points}
-    if cloud.normals is not None:
-        arrays["normals"] = cloud.normals
-    np.savez(stream, **arrays)
+    if cloud.normals is None:
+        np.savez(stream, points=cloud.points)
+    else:
+        np.savez(stream, points=cloud.points, normals=cloud.normals)
