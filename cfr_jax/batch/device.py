@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -30,7 +30,7 @@ _KEPT = 32  # encoded targets, about 2 MB each
 class Device:
     """What runs on the accelerator, with the targets it has encoded lately."""
 
-    def __init__(self, params: Mapping, refine: Refinement | None, second_look: bool, size: int):
+    def __init__(self, params: dict, refine: Refinement | None, second_look: bool, size: int):
         self._params, self._refine, self.size = params, refine, size
         self._second_look = refine is not None and second_look
         self._encoded = Memo(_KEPT)
@@ -91,14 +91,14 @@ def signature(plan: Plan) -> tuple:
 
 
 @jax.jit
-def encode_target(params: Mapping, target: solving.DeviceCloud) -> Encoded:
+def encode_target(params: dict, target: solving.DeviceCloud) -> Encoded:
     """The target's side of `solving.solve`, for a cloud as `solving.on_device` hands it over."""
-    return encode(dict(params), target.prepared(), settings=SETTINGS)
+    return encode(params, target.prepared(), settings=SETTINGS)
 
 
 @functools.partial(jax.jit, static_argnames=("refine",))
 def solve_many(
-    params: Mapping,
+    params: dict,
     sources: Sequence[solving.DeviceCloud],
     targets: Sequence[Encoded],
     *,
