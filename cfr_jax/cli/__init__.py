@@ -43,23 +43,23 @@ _COMMANDS = (
 _DESCRIPTION = """\
 Registers 3D point clouds: finds the rigid motion that lays one cloud on another.
 
-  cfr demo                          see it work on a pair that comes along
+  cfr demo                          see it work on a pair that ships with it
   cfr register scan1.ply scan2.pcd  the motion from scan1 onto scan2, and how far to trust it
 """
 
 _EPILOG = """\
 exit codes:
   0    done
-  1    a fault of the program (with a traceback: please report it)
+  1    a bug in the program (with a traceback: please report it)
   2    an input, an option or an output that cannot be used (at most three lines on stderr)
   3    registered, but not to be trusted (only with --strict)
   130  interrupted
-  141  whoever read the output has gone
+  141  the reader of the output has closed it
 
 environment:
   CFR_JAX_CACHE      where compiled programs are kept, so that the next call starts faster:
                      a folder, or "off" (default: $XDG_CACHE_HOME/cfr_jax or ~/.cache/cfr_jax)
-  CFR_JAX_TRACEBACK  set it to see where an error message comes from
+  CFR_JAX_TRACEBACK  set it to get the traceback of an error message
 """
 
 INTERRUPTED = 130

@@ -18,25 +18,26 @@ if TYPE_CHECKING:
 UNTRUSTED = 3
 
 _DESCRIPTION = """\
-Registers many pairs. PAIRS is recognized by its layout, which is told before anything is done:
+Registers many pairs. PAIRS is recognized by its layout, which is printed first:
 
 {kinds}
 
-Paths in a list are relative to its folder; a line may go on with 16 numbers, the known truth, which
-is not used here. A pair in HDF5 is a group with source (N, 3) and target (M, 3). The files of a
-folder are laid on --target, or a_source.ply on a_target.ply, or each file on the one before it.
+Paths in a list are relative to its folder; a line may also hold 16 numbers, the known truth,
+which is not used here. A pair in HDF5 is a group with source (N, 3) and target (M, 3). The files of
+a folder are registered onto --target, or a_source.ply onto a_target.ply, or each file onto the
+one before it.
 
-Two files are written. results.jsonl holds everything that is known, a line a pair, each written as
-soon as its pair is done. results.csv, the table in the order of the pairs, appears when all are.
-Run the same command again after a crash, a kill or Ctrl-C, and it goes on where it stopped. A pair
-that cannot be read is a row with the reason, and stops no other.
+This writes two files. results.jsonl holds the full report, one line per pair, written as soon as
+the pair is done. results.csv is a table in the order of the pairs, written when all are done. After
+a crash, a kill or Ctrl-C, run the same command again, and it continues where it stopped. A pair
+that cannot be read becomes a row with the reason, and does not stop the others.
 """
 
 _EPILOG = """\
 examples:
   cfr batch pairs.csv --out results.csv
   cfr batch scans/ --target model.ply --out results.csv   the target is encoded once
-  cfr batch pairs.csv --out results.csv --retry-failed    after the bad files were mended
+  cfr batch pairs.csv --out results.csv --retry-failed    after fixing the bad files
   cfr batch pairs.csv --out results.csv --shard 2/4       on the second of four machines; without
                                                           --shard, the table of all of them
 """
@@ -60,18 +61,18 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--layout",
         metavar="KIND",
-        help="which of these PAIRS is, where it is not recognized as it should be",
+        help="which of these PAIRS is, if it is not recognized correctly",
     )
     parser.add_argument(
         "--target", metavar="FILE", type=Path, help="the target of every cloud in a folder"
     )
     parser.add_argument(
-        "--retry-failed", action="store_true", help="try the pairs again that failed before"
+        "--retry-failed", action="store_true", help="retry the pairs that failed before"
     )
     parser.add_argument(
         "--shard",
         metavar="I/N",
-        help="every N-th pair, from the I-th on; auto: as the cluster tells jax.distributed",
+        help="every N-th pair, from the I-th on; auto: ask the cluster, by jax.distributed",
     )
     parser.add_argument(
         "--strict",
@@ -79,16 +80,20 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help=f"exit with {UNTRUSTED} if a pair failed or is not to be trusted",
     )
     how = parser.add_argument_group("how to register")
-    how.add_argument("--no-refine", action="store_true", help="the network's own answers")
+    how.add_argument("--no-refine", action="store_true", help="take the network's own answers")
     how.add_argument(
-        "--no-second-look", action="store_true", help="keep first answers, also those in doubt"
+        "--no-second-look", action="store_true", help="keep the first answers, even if in doubt"
     )
     how.add_argument("--weights", metavar="W", help="a shipped name, or a .safetensors file")
     how.add_argument(
         "--max-points", metavar="N", type=numbers.positive, help="most points of each cloud"
     )
     how.add_argument(
-        "--seed", metavar="S", type=numbers.not_negative, default=0, help="of the choice of points"
+        "--seed",
+        metavar="S",
+        type=numbers.not_negative,
+        default=0,
+        help="seed of the choice of points",
     )
     how.add_argument(
         "--batch-size",

@@ -12,19 +12,19 @@ PAIRS = 500
 
 _DESCRIPTION = """\
 The confidence of an answer is the probability that it is right to 5 degrees and a tenth of the
-clouds' radius. How the signs of a right answer make a probability depends on the weights, so it is
-measured: pairs with known motions are registered, and the confidence is fitted to which answers
-came out right. Weights that train.py has just made have none yet:
+clouds' radius. How the signs of a right answer translate into a probability depends on the weights.
+So this command registers pairs with known motions, and fits the confidence to which answers are
+right. Weights that train.py has just made have no confidence yet:
 
   cfr calibrate runs/parts/weights.safetensors --data corpus/val.h5 --out parts.safetensors
   cfr register a.ply b.ply --weights parts.safetensors
 
-The new file holds the same weights and notes, and the coefficients beside them.
+The new file holds the same weights and notes, plus the coefficients.
 
-The data must not have been trained on. They are a corpus of shapes (`cfr data build`), of which
+Use data that the weights were not trained on: a corpus of shapes (`cfr data build`), from which
 pairs of all kinds are made, or pairs of your own: a CSV list `source,target,` and the 16 numbers of
-the motion from source onto target, row by row, or an HDF5 file of pairs. Some of those are turned
-or halved: a confidence is learned from wrong answers, too.
+the motion from source onto target, row by row, or an HDF5 file of pairs. Some of those are rotated
+or halved, because the fit needs wrong answers, too.
 
 A second call measures how well the confidence holds on other data, and fits nothing:
 
@@ -45,14 +45,14 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.set_defaults(run=run)
     parser.add_argument(
-        "weights", metavar="WEIGHTS", help="a .safetensors file, or a name that ships"
+        "weights", metavar="WEIGHTS", help="a .safetensors file, or the name of shipped weights"
     )
     parser.add_argument(
         "--data",
         metavar="PAIRS_OR_CORPUS",
         type=Path,
         required=True,
-        help="pairs with known motions, or shapes to make pairs of",
+        help="pairs with known motions, or shapes to make pairs from",
     )
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
@@ -66,7 +66,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         metavar="N",
         type=positive,
         default=PAIRS,
-        help=f"how many pairs to make of the data (default: {PAIRS})",
+        help=f"how many pairs to make from the data (default: {PAIRS})",
     )
     parser.add_argument(
         "--seed", metavar="N", type=not_negative, default=0, help="which ones (default: 0)"
@@ -75,13 +75,13 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--keep",
         metavar="FILE.npz",
         type=Path,
-        help="keep what was found of each pair there: a call that was cut off goes on from it",
+        help="keep the findings for each pair here; an interrupted run continues from it",
     )
     parser.add_argument(
         "--figure",
         metavar="FILE.png",
         type=Path,
-        help="draw how far the confidence holds (needs matplotlib)",
+        help="draw how well the confidence holds (needs matplotlib)",
     )
 
 

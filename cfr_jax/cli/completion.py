@@ -9,8 +9,8 @@ from typing import Any
 SHELLS = ("bash", "zsh", "fish")
 
 _DESCRIPTION = """\
-Writes the script that lets a shell complete commands, options and file names, made from what
-`cfr --help` knows (pip install "cfr_jax[completion]"):
+Writes the script that lets a shell complete commands, options and file names. It is made from
+the options of `cfr` (pip install "cfr_jax[completion]"):
 
   bash   cfr completion bash > ~/.local/share/bash-completion/completions/cfr
   zsh    cfr completion zsh > "${fpath[1]}/_cfr"

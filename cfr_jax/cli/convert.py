@@ -16,8 +16,8 @@ Converts a checkpoint of the CFR authors' PyTorch program into weights for this 
 A checkpoint of the RPM-Net authors' program is recognized by its names, and converted for
 evaluate.py, which compares the two.
 
-A .pth or .pt file is read by PyTorch (pip install "cfr_jax[torch]"), tensors only: nothing in it is
-run. A .safetensors or .npz file of the same tensors under the same names needs no PyTorch.
+A .pth or .pt file is read by PyTorch (pip install "cfr_jax[torch]"), tensors only: no code in
+it is run. A .safetensors or .npz file of the same tensors under the same names needs no PyTorch.
 """
 
 
@@ -25,7 +25,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     """Adds `cfr convert`."""
     parser = commands.add_parser(
         "convert",
-        help="the authors' PyTorch weights into ours",
+        help="convert the authors' PyTorch weights into ours",
         description=_DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,

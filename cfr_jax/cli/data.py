@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from cfr_jax.data.making.build import Report
 
 _DESCRIPTION = """\
-Builds the corpora that networks are trained and tested on, and shows what is in one:
+Builds the corpora that networks are trained and tested on, and shows what a corpus holds:
 
   cfr data open-cad --out open_cad             the open corpus, from four packages of Debian 12
   cfr data build meshes/ --out corpus/         your own meshes, one folder per category
@@ -23,9 +23,9 @@ Builds the corpora that networks are trained and tested on, and shows what is in
 """
 
 _BUILD = """\
-Turns a folder of meshes into a corpus: 2048 points a shape, drawn by area, with the normals of
+Turns a folder of meshes into a corpus: 2048 points per shape, drawn by area, with the normals of
 their faces, in the unit sphere. The first folder below FOLDER is the category. Flat shapes, shapes
-of fewer than 20 faces (a box has 12: --least-faces), and duplicates are left out; left_out.txt,
+with fewer than 20 faces (a box has 12: --least-faces), and duplicates are left out; left_out.txt,
 beside the corpus, names them. Meshes are files that end in
 {suffixes}
 
@@ -48,7 +48,7 @@ CREDITS.md is written beside the files, keep it there.
 """
 
 _INFO = """\
-What FILE is, told by its layout, and what a corpus holds: shapes by category, points a shape. A
+Says what FILE is, by its layout, and what a corpus holds: shapes by category, points per shape. A
 corpus is an HDF5 file in the layout of modelnet40_ply_hdf5_2048, or a folder of them.
 """
 
@@ -60,7 +60,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "allow_abbrev": False,
     }
     parser = subparsers.add_parser(
-        "data", help="corpora of shapes: build one, look at one", description=_DESCRIPTION, **style
+        "data", help="build a corpus of shapes, or look at one", description=_DESCRIPTION, **style
     )
     commands = parser.add_subparsers(
         title="commands", dest="data_command", metavar="COMMAND", required=True
@@ -68,12 +68,14 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
     build = commands.add_parser(
         "build",
-        help="a corpus from a folder of meshes",
+        help="build a corpus from a folder of meshes",
         description=_BUILD.format(suffixes=in_words(mesh_formats())),
         **style,
     )
     build.set_defaults(run=_build)
-    build.add_argument("folder", metavar="FOLDER", type=Path, help="meshes, a folder per category")
+    build.add_argument(
+        "folder", metavar="FOLDER", type=Path, help="meshes, one folder per category"
+    )
     build.add_argument(
         "--out", metavar="DIR|FILE.h5", type=Path, required=True, help="where the corpus goes"
     )
@@ -81,18 +83,21 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "--unseen", metavar="A,B,...", help="categories for test.h5 ('none' for none of them)"
     )
     build.add_argument(
-        "--points", metavar="N", type=int, default=2048, help="points a shape (2048)"
+        "--points", metavar="N", type=int, default=2048, help="points per shape (2048)"
     )
     build.add_argument(
         "--least-faces",
         metavar="N",
         type=int,
         default=20,
-        help="fewer, and a mesh is left out (20)",
+        help="leave out meshes with fewer faces (20)",
     )
 
     open_cad = commands.add_parser(
-        "open-cad", help="the open corpus, from Debian's packages", description=_OPEN_CAD, **style
+        "open-cad",
+        help="build the open corpus from Debian's packages",
+        description=_OPEN_CAD,
+        **style,
     )
     open_cad.set_defaults(run=_open_cad)
     open_cad.add_argument(
@@ -109,7 +114,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     )
 
     info = commands.add_parser(
-        "info", help="what a corpus holds", description=_INFO, **style
+        "info", help="show what a corpus holds", description=_INFO, **style
     )  # fmt: skip
     info.set_defaults(run=_info)
     info.add_argument(

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     import numpy as np
 
 _DESCRIPTION = """\
-Registers two views of an object, as a depth camera would see it from two places, that ship with
-the package; prints the motion, its quality, and its error against the known truth; and writes
-demo.png (before and after) and demo.html (to turn in a browser) into a folder.
+Registers two views that ship with the package: an object as a depth camera would see it from two
+places. Prints the motion, its quality, and its error against the known truth. Writes demo.png
+(before and after) and demo.html (to rotate in a browser) into a folder.
 """
 _PAIR = Path(__file__).parent / "demo_pair"
 
@@ -24,7 +24,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     """Adds `cfr demo`."""
     parser = commands.add_parser(
         "demo",
-        help="register a pair that comes along, and show it",
+        help="register a pair that ships with the package, and show it",
         description=_DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
@@ -35,7 +35,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         metavar="DIR",
         type=Path,
         default=Path("out"),
-        help="folder for the pictures, made if it is not there (default: out)",
+        help="folder for the pictures, created if missing (default: out)",
     )
 
 

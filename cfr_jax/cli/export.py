@@ -8,15 +8,15 @@ from pathlib import Path
 from cfr_jax.cli.shared import outputs
 
 _DESCRIPTION = """\
-Writes the network, its weights inside, as one program that JAX runs wherever it runs:
+Writes the network, with its weights inside, as one program that runs wherever JAX runs:
 
   cfr export --points 1024 --platforms cpu,cuda,tpu --out model.stablehlo
   python examples/run_exported.py model.stablehlo source.npy target.npy
 
-The host needs jax and flatbuffers, and nothing of this package. The program is `register`: the
+The host needs jax and flatbuffers, but not this package. The program is `register`: the
 network alone, without refinement and confidence. Its arguments are source, source_count, target,
 target_count: float32 clouds of exactly --points rows, padded, of unit size, and how many of the
-rows count. It gives transform (source onto target), transforms, weights and covered.
+rows count. It returns transform (source onto target), transforms, weights and covered.
 """
 
 
@@ -24,7 +24,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     """Adds `cfr export`."""
     parser = commands.add_parser(
         "export",
-        help="the network as one program, for hosts without this package",
+        help="write the network as one program, for hosts without this package",
         description=_DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
@@ -49,12 +49,12 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--normals",
         action="store_true",
-        help="clouds come with unit normals, (N, 6); without it normals are estimated inside",
+        help="clouds come with unit normals, (N, 6); without it, the program estimates them",
     )
     parser.add_argument(
         "--batch",
         action="store_true",
-        help="many pairs in one call: one more axis in front, of any length",
+        help="many pairs per call: adds a leading axis of any length",
     )
     parser.add_argument(
         "--weights",

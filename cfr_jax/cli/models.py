@@ -15,13 +15,13 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     """Adds `cfr models`."""
     parser = commands.add_parser(
         "models",
-        help="the weights that ship, and their scores",
+        help="list the shipped weights and their scores",
         description=_DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
     parser.set_defaults(run=run)
-    parser.add_argument("name", metavar="NAME", nargs="?", help="these weights alone")
+    parser.add_argument("name", metavar="NAME", nargs="?", help="show only these weights")
     parser.add_argument("--json", action="store_true", help="everything on the cards, as JSON")
 
 

@@ -31,7 +31,7 @@ files:
 what the quality means:
   fitness         share of the source's points that lie within the inlier distance of the target
   inlier RMSE     root mean square distance of those points, in the files' unit
-  overlap         share of the source that the target saw, too, as far as one can tell
+  overlap         estimated share of the source that the target also saw
   confidence      probability, 0 to 1, that the motion is right to 5 degrees and a tenth of the
                   clouds' radius
   not determined  the shapes leave a motion open (a plane on a plane, a line, a sphere)
@@ -42,9 +42,9 @@ examples:
   cfr register a.ply b.ply                             print the motion and its quality
   cfr register a.ply b.ply --out a_on_b.ply            write the source, moved onto the target
   cfr register a.pcd b.las --json - | jq .transform    use it in a script
-  cfr register a.ply b.ply --view page.html            turn the result in a browser
+  cfr register a.ply b.ply --view page.html            rotate the result in a browser
   cfr register a.ply b.ply --initial previous.json     start from an earlier answer
-  cfr register a.ply b.ply --global                    if they may be turned by any angle
+  cfr register a.ply b.ply --global                    if they may be rotated by any angle
   cfr register a.ply b.ply --strict || echo "look at it"
 """
 
@@ -53,7 +53,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     """Adds `cfr register`."""
     parser = commands.add_parser(
         "register",
-        help="the motion that lays one point cloud on another",
+        help="find the motion that lays one point cloud on another",
         description=_DESCRIPTION,
         epilog=_EPILOG.format(files=_files()),
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -74,11 +74,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--json",
         metavar="FILE",
         type=Path,
-        help="everything that is known, as JSON; - for standard output, then nothing else goes "
+        help="the full report, as JSON; - writes it to standard output, and nothing else goes "
         "there",
     )
     written.add_argument(
-        "--view", metavar="PAGE.html", type=Path, help="a page to look at the result from all sides"
+        "--view", metavar="PAGE.html", type=Path, help="a page that shows the result from all sides"
     )
     written.add_argument(
         "--png",
@@ -143,7 +143,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         metavar="S",
         type=numbers.not_negative,
         default=0,
-        help="of the random choice of points (default: 0); the same seed gives the same answer",
+        help="seed of the choice of points (default: 0); the same seed gives the same answer",
     )
     how.add_argument(
         "--strict",

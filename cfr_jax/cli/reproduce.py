@@ -15,11 +15,11 @@ FORMAT = "cfr_jax/reproduce/1"
 MISSED = 3
 
 _DESCRIPTION = f"""\
-Measures weights that ship (`cfr models` lists them) once more, on pairs of held-out shapes that
-ship, too, and says whether the score on their card holds here. Takes a minute or two.
+Measures shipped weights (`cfr models` lists them) again, on pairs of held-out shapes that also
+ship, and says whether the score on their card holds here. Takes a minute or two.
 
 Exits with {MISSED} if a score is worse than published by more than its tolerance, which leaves room
-for another processor's rounding.
+for the rounding of other processors.
 """
 
 

@@ -16,7 +16,7 @@ Draws a result that `cfr register --json` wrote, without registering again:
   cfr view result.json --out scene.rrd && rerun scene.rrd   (pip install "cfr_jax[rerun]")
 
 The two clouds are read again from where they were; if they have been moved, --source and --target
-say where they are now. A page is one file that asks the network for nothing; a PNG needs no
+say where they are now. A page is one file that loads nothing from the network; a PNG needs no
 display (pip install "cfr_jax[viz]"). Correspondence weights are not saved with a result: `cfr
 register --view` shows them.
 """
@@ -26,7 +26,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     """Adds `cfr view`."""
     parser = commands.add_parser(
         "view",
-        help="the picture of a saved result",
+        help="draw a saved result",
         description=_DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
@@ -44,9 +44,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "(default: the name of the result, with .html)",
     )
     for role in ("source", "target"):
-        parser.add_argument(
-            f"--{role}", metavar="FILE", type=Path, help=f"where the {role} lies now"
-        )
+        parser.add_argument(f"--{role}", metavar="FILE", type=Path, help=f"where the {role} is now")
 
 
 _SUFFIXES = (*outputs.PAGE_SUFFIXES, *outputs.PICTURE_SUFFIXES, *outputs.RECORDING_SUFFIXES)
