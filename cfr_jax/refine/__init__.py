@@ -31,8 +31,8 @@ class Refinement:
     home: str | Callable[..., Fit]
     """The function, or where it is, as "module:function", to be imported on first use."""
     traceable: bool = False
-    """Whether JAX can trace it: then it becomes part of the network's program and gets ``Surface`` objects.
-    All others run on the host and get ``HostSurface`` objects."""
+    """Whether JAX can trace it. Then it is part of the network's program and gets ``Surface``
+    objects. All others run on the host and get ``HostSurface`` objects."""
     every_point: bool = False
     """Whether it gets all points of the clouds, and not only those that the network saw."""
     library: str | None = None
