@@ -45,7 +45,10 @@ def items_at(count: int, position: int, size: int, seed: int) -> Int[np.ndarray,
     belongs to seed and epoch."""
     epochs, places = np.divmod(np.arange(position, position + size), count)
     return np.array(
-        [_order(count, seed, epoch)[place] for epoch, place in zip(epochs, places, strict=True)]
+        [
+            _order(count, seed, int(epoch))[place]
+            for epoch, place in zip(epochs, places, strict=True)
+        ]
     )
 
 
