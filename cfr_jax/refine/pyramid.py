@@ -97,7 +97,7 @@ def _normals(points: np.ndarray) -> np.ndarray:
 
 
 def _pairs(
-    source: Level, target: Level, transform: np.ndarray, cut: float
+    source: Level, target: Level, transform: np.ndarray, cut: float | np.float32
 ) -> tuple[np.ndarray, np.ndarray]:
     """The closest target point of each source point, and its distance; infinite beyond the cut."""
     moved = motions.apply(transform, source.points)
