@@ -89,3 +89,14 @@ def params(state_dict):
     from cfr_jax.weights.authors import from_state_dict
 
     return from_state_dict(state_dict)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs_of_one_file():
+    """Compiled programs go when the file that used them is done. Kept by the thousand in one process
+    they use up its memory maps, and XLA then dies with a segmentation fault."""
+    yield
+    from cfr_jax.runtime import programs
+
+    programs._program.cache_clear()
+    jax.clear_caches()

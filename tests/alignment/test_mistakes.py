@@ -68,7 +68,7 @@ MISTAKES = {
     "a truth that scales": ("batch scaled.csv --out r.csv", "got a matrix that is not rigid"),
     "other columns": ("batch columns.csv --out r.csv", "wanted 16 numbers after the two files"),
     "a binary list": ("batch binary.csv --out r.csv", "wanted a CSV list"),
-    "a cloud for a list": ("batch a.ply --out r.csv", "wanted a CSV list of `source,target` lines, an HDF5 file"),
+    "a cloud for a list": ("batch a.ply --out r.csv", "wanted a CSV list of `source,target` lines"),
     "an empty folder": ("batch nothing --out r.csv", "it holds nothing\nwanted a CSV list"),
     "a folder of photos": ("batch photos --out r.csv", "it holds 1 .jpg\nwanted a CSV list"),
     "one cloud in a folder": ("batch single --out r.csv", "give --target FILE"),
@@ -88,7 +88,7 @@ MISTAKES = {
     "all files bad": ("batch bad.csv --out r.csv", "add --retry-failed"),
     # data
     "no corpus": ("data info none.h5", "A corpus is an HDF5 file"),
-    "notes for a corpus": ("data info photo.jpg", "an HDF5 file of pairs, the folder of ModelNet40"),
+    "notes for a corpus": ("data info photo.jpg", "an HDF5 file of pairs, the folder"),
     "a sheet of clouds": ("data info scans --sheet s.png", "wanted a corpus of shapes"),
     "a sheet of no format": ("data info shapes.h5 --sheet s.jpg", "that ends in .png"),
     "no meshes": ("data build photos --out c.h5", "wanted files that end in .ply .off"),
