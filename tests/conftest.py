@@ -93,8 +93,8 @@ def params(state_dict):
 
 @pytest.fixture(scope="module", autouse=True)
 def programs_of_one_file():
-    """Compiled programs go when the file that used them is done. Kept by the thousand in one process
-    they use up its memory maps, and XLA then dies with a segmentation fault."""
+    """Compiled programs go when the file that used them is done. A process that keeps thousands of
+    them runs out of memory maps, and XLA then dies with a segmentation fault."""
     yield
     from cfr_jax.runtime import programs
 
