@@ -19,6 +19,7 @@ from cfr_jax.alignment.search import search
 from cfr_jax.alignment.second_look import look_again
 from cfr_jax.alignment.solving import solve_case
 from cfr_jax.networks.probability import calibration_of
+from cfr_jax.networks.record import Params
 from cfr_jax.refine import Refinement, find
 from cfr_jax.weights.files import load_params
 
@@ -27,7 +28,7 @@ def align(
     source: Any,
     target: Any,
     *,
-    params: dict | None = None,
+    params: Params | None = None,
     refine: bool | str = True,
     initial: Float[np.ndarray, "4 4"]
     | Float[np.ndarray, "k 4 4"]
@@ -104,7 +105,7 @@ def steps(
         )
 
 
-def checked_params(params: Any) -> dict:
+def checked_params(params: Any) -> Params:
     """The weights that ship for None; raises ValueError for what are no parameters, and for a
     calibration made of other clues than `align` finds."""
     params = _default_params() if params is None else params
@@ -118,5 +119,5 @@ def checked_params(params: Any) -> dict:
 
 
 @functools.cache
-def _default_params() -> dict:
+def _default_params() -> Params:
     return load_params()

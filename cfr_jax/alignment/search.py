@@ -23,6 +23,7 @@ from cfr_jax.alignment.solving import DeviceCloud, on_device, surface, timed
 from cfr_jax.geometry import rigid, units
 from cfr_jax.networks.cfr.registration import encode, register
 from cfr_jax.networks.inputs import Settings, moved_by
+from cfr_jax.networks.record import Params
 from cfr_jax.refine import generalized_icp
 from cfr_jax.runtime import programs
 
@@ -51,7 +52,7 @@ programs.storable(Candidates)
 
 @functools.partial(jax.jit, static_argnames=("kept", "at_once"))
 def propose(
-    params: dict,
+    params: Params,
     source: DeviceCloud,
     target: DeviceCloud,
     starts: Float[Array, "s 4 4"],

@@ -26,6 +26,7 @@ from cfr_jax.networks.cfr.registration import Registration, encode, register
 from cfr_jax.networks.clues import NetworkClues
 from cfr_jax.networks.inputs import Cloud, Settings, prepare
 from cfr_jax.networks.probability import Calibration
+from cfr_jax.networks.record import Params
 from cfr_jax.refine import Refinement, generalized_icp
 from cfr_jax.refine.generalized_icp import scores
 from cfr_jax.refine.surfaces import Surface
@@ -60,7 +61,7 @@ programs.storable(
 programs.storable_static(Calibration, Calibration.write, Calibration.read)
 
 
-def solve(params: dict, source: Cloud, target: Encoded, *, refine: Refinement | None) -> Found:
+def solve(params: Params, source: Cloud, target: Encoded, *, refine: Refinement | None) -> Found:
     """The device's part for one pair of unit clouds: registered, refined, judged.
 
     Refining never answers worse, by its own score, than the network did or than the source lay
@@ -127,7 +128,7 @@ def on_device(unit: UnitCloud) -> DeviceCloud:
 
 @functools.partial(jax.jit, static_argnames=("refine",))
 def solve_pair(
-    params: dict, source: DeviceCloud, target: DeviceCloud, *, refine: Refinement | None
+    params: Params, source: DeviceCloud, target: DeviceCloud, *, refine: Refinement | None
 ) -> Found:
     """`solve` for two clouds as `on_device` hands them over."""
     encoded = encode(params, target.prepared(), settings=SETTINGS)

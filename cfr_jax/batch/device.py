@@ -6,7 +6,7 @@ import functools
 import hashlib
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,12 @@ from cfr_jax.batch.memo import Memo
 from cfr_jax.geometry.units import UnitCloud
 from cfr_jax.networks.cfr.iterations import Encoded
 from cfr_jax.networks.cfr.registration import encode
+from cfr_jax.networks.record import Params
 from cfr_jax.refine import Refinement
 from cfr_jax.runtime import programs
+
+Signature: TypeAlias = tuple[tuple[tuple[int, ...], tuple[int, ...], bool], ...]
+"""Of source and target: the shapes of points and neighbors, and whether there are no normals."""
 
 _KEPT = 32  # encoded targets, about 2 MB each
 
@@ -30,8 +34,9 @@ _KEPT = 32  # encoded targets, about 2 MB each
 class Device:
     """What runs on the accelerator, with the targets it has encoded lately."""
 
-    def __init__(self, params: dict, refine: Refinement | None, second_look: bool, size: int):
-        self._params, self._refine, self.size = params, refine, size
+    def __init__(self, params: Params, refine: Refinement | None, second_look: bool, size: int):
+        self._params, self._refine = params, refine
+        self.size: int = size
         self._second_look = refine is not None and second_look
         self._encoded = Memo(_KEPT)
 
@@ -82,7 +87,7 @@ class Device:
         return self._encoded.get(_digest(target), make), compiling
 
 
-def signature(plan: Plan) -> tuple:
+def signature(plan: Plan) -> Signature:
     """Equal for plans that one compiled program can solve."""
     return tuple(
         (cloud.points.shape, cloud.neighbors.shape, cloud.normals is None)
@@ -91,14 +96,14 @@ def signature(plan: Plan) -> tuple:
 
 
 @jax.jit
-def encode_target(params: dict, target: solving.DeviceCloud) -> Encoded:
+def encode_target(params: Params, target: solving.DeviceCloud) -> Encoded:
     """The target's side of `solving.solve`, for a cloud as `solving.on_device` hands it over."""
     return encode(params, target.prepared(), settings=SETTINGS)
 
 
 @functools.partial(jax.jit, static_argnames=("refine",))
 def solve_many(
-    params: dict,
+    params: Params,
     sources: Sequence[solving.DeviceCloud],
     targets: Sequence[Encoded],
     *,

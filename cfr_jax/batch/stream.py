@@ -14,10 +14,11 @@ import jax
 from cfr_jax.alignment.align import checked_params
 from cfr_jax.alignment.answers import Alignment
 from cfr_jax.alignment.planning import DEFAULT_BUDGET, Plan, planned, whole_number
-from cfr_jax.batch.device import Device, signature
+from cfr_jax.batch.device import Device, Signature, signature
 from cfr_jax.batch.memo import Memo
 from cfr_jax.geometry import units
 from cfr_jax.io import PointCloud, as_point_cloud
+from cfr_jax.networks.record import Params
 from cfr_jax.refine import find
 
 # More pairs a call keep an accelerator busy, and a CPU's caches cold.
@@ -41,7 +42,7 @@ class Outcome:
 def align_many(
     pairs: Iterable[Any],
     *,
-    params: dict | None = None,
+    params: Params | None = None,
     refine: bool | str = True,
     max_points: int | None = None,
     second_look: bool = True,
@@ -131,9 +132,9 @@ class _Planner:
 
 def _done(plan: _Planner, pairs: Iterable[Any], device: Device, workers: int) -> Iterator[Outcome]:
     """Outcomes as they come; the bucket that holds the oldest pair goes first where many wait."""
-    waiting: dict[tuple, list[tuple[int, Plan]]] = {}
+    waiting: dict[Signature, list[tuple[int, Plan]]] = {}
 
-    def solve(key: tuple) -> Iterator[Outcome]:
+    def solve(key: Signature) -> Iterator[Outcome]:
         rows, plans = zip(*waiting.pop(key), strict=True)
         for row, alignment in zip(rows, device.solve(plans), strict=True):
             yield Outcome(row, alignment, None)

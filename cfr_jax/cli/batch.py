@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cfr_jax.cli.shared import numbers, outputs
+from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.data import kinds
 
 if TYPE_CHECKING:
     from cfr_jax.batch.jobs import Job
     from cfr_jax.batch.journal import Journal
     from cfr_jax.batch.sharding import Shard
+    from cfr_jax.networks.record import Params
 
 UNTRUSTED = 3
 
@@ -43,7 +45,7 @@ examples:
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr batch`."""
     parser = commands.add_parser(
         "batch",
@@ -168,7 +170,7 @@ def run(args: argparse.Namespace) -> int:
     return _tell(records, out, kept, args.strict)
 
 
-def _register(left: list[Job], journal: Journal, params: dict, args: argparse.Namespace) -> None:
+def _register(left: list[Job], journal: Journal, params: Params, args: argparse.Namespace) -> None:
     from cfr_jax.batch.records import as_record
     from cfr_jax.batch.stream import align_many
     from cfr_jax.runtime.progress import Progress

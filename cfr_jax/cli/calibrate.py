@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.cli.shared.numbers import not_negative, positive
 
 PAIRS = 500
@@ -34,7 +35,7 @@ Each pair takes about a second on a CPU.
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr calibrate`."""
     parser = commands.add_parser(
         "calibrate",

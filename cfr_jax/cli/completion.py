@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Callable
 from typing import Any
 
+from cfr_jax.cli.shared.commands import Commands
+
 SHELLS = ("bash", "zsh", "fish")
 
 _DESCRIPTION = """\
@@ -18,7 +20,7 @@ the options of `cfr` (pip install "cfr_jax[completion]"):
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr completion`."""
     parser = commands.add_parser(
         "completion",

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 
 _DESCRIPTION = """\
 Converts a checkpoint of the CFR authors' PyTorch program into weights for this one:
@@ -21,7 +22,7 @@ it is run. A .safetensors or .npz file of the same tensors under the same names 
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr convert`."""
     parser = commands.add_parser(
         "convert",

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.data.making.mesh_formats import mesh_formats
 from cfr_jax.io.formats import in_words
 
@@ -53,7 +54,7 @@ corpus is an HDF5 file in the layout of modelnet40_ply_hdf5_2048, or a folder of
 """
 
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
+def add_parser(subparsers: Commands) -> None:
     """Adds `cfr data` with its own commands."""
     style: dict[str, Any] = {
         "formatter_class": argparse.RawDescriptionHelpFormatter,

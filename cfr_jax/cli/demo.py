@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,7 +21,7 @@ places. Prints the motion, its quality, and its error against the known truth. W
 _PAIR = Path(__file__).parent / "demo_pair"
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr demo`."""
     parser = commands.add_parser(
         "demo",

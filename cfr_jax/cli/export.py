@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 
 _DESCRIPTION = """\
 Writes the network, with its weights inside, as one program that runs wherever JAX runs:
@@ -20,7 +21,7 @@ rows count. It returns transform (source onto target), transforms, weights and c
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr export`."""
     parser = commands.add_parser(
         "export",

@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 
+from cfr_jax.cli.shared.commands import Commands
+
 _DESCRIPTION = """\
 Lists the weights that ship with the package: digest, parameters, the licenses of the data they were
 trained on, and their measured scores. `cfr reproduce NAME` measures one of them again.
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr models`."""
     parser = commands.add_parser(
         "models",

@@ -12,6 +12,7 @@ from typing import Any
 
 from cfr_jax import refine
 from cfr_jax.cli.shared import numbers, outputs
+from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.io import formats
 
 UNTRUSTED = 3
@@ -49,7 +50,7 @@ examples:
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr register`."""
     parser = commands.add_parser(
         "register",

@@ -10,6 +10,7 @@ from typing import Any
 
 from cfr_jax.cli import models
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 
 FORMAT = "cfr_jax/reproduce/1"
 MISSED = 3
@@ -23,7 +24,7 @@ for the rounding of other processors.
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr reproduce`."""
     parser = commands.add_parser(
         "reproduce",

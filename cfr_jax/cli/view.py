@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 
 _DESCRIPTION = """\
 Draws a result that `cfr register --json` wrote, without registering again:
@@ -22,7 +23,7 @@ register --view` shows them.
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr view`."""
     parser = commands.add_parser(
         "view",

@@ -137,7 +137,7 @@ def finish_pair(
     truth: Float[np.ndarray, "4 4"],
     sampling: Sampling,
     rng: np.random.Generator,
-) -> dict:
+) -> dict[str, Any]:
     """A training pair as arrays: both clouds with their neighbors, and the true motion.
 
     `truth` maps the views onto each other, source onto target; what comes back as "transform" does

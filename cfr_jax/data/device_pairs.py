@@ -69,12 +69,12 @@ def draw_pairs(
     items: Int32[Array, " b"],
     positions: UInt32[Array, " b"],
     sampling: Sampling,
-) -> dict:
+) -> dict[str, Array]:
     """A batch as `loader.batch_at` makes it: a pair of shape `items[i]` for each place
     `positions[i]` of the stream, arrays (b, ...). `sampling` is static."""
     key = random.key(seed)
 
-    def one(item: Array, position: Array) -> dict:
+    def one(item: Array, position: Array) -> dict[str, Array]:
         return draw_pair(
             shapes.points[item], shapes.normals[item], random.fold_in(key, position), sampling
         )
@@ -87,7 +87,7 @@ def draw_pair(
     normals: Int8[Array, "p 3"],
     key: Key[Array, ""],
     sampling: Sampling,
-) -> dict:
+) -> dict[str, Array]:
     """A pair of one shape, as `augment.finish_pair` gives it: both clouds (n, 3) float32 with
     normals and neighbors (n, k), `transform` (4, 4), source onto target, and whether normals are to
     be estimated."""

@@ -10,7 +10,7 @@ import collections
 import functools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int
@@ -24,12 +24,14 @@ class Source(Protocol):
 
     def __len__(self) -> int: ...
 
-    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
+    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
         """A pair made of item `index`, as `augment.finish_pair` gives it."""
         ...
 
 
-def batch_at(source: Source, position: int, size: int, sampling: Sampling, seed: int) -> dict:
+def batch_at(
+    source: Source, position: int, size: int, sampling: Sampling, seed: int
+) -> dict[str, np.ndarray]:
     """The `size` pairs from `position` on of the endless shuffled stream; arrays (size, ...)."""
     pairs = []
     for number, item in zip(
@@ -67,7 +69,7 @@ def batches(
     seed: int,
     workers: int = 2,
     share: slice = slice(None),
-) -> Iterator[dict]:
+) -> Iterator[dict[str, np.ndarray]]:
     """`count` batches from `position` on, made by `workers` threads ahead of their use.
 
     Of each batch only the rows in `share` are made: with several processes, each makes its own.

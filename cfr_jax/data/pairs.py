@@ -121,7 +121,9 @@ class CsvPairs(PairFile):
             raise ValueError(f"{self.path} is no list in CSV ({error})") from error
         if not self._rows:
             raise ValueError(f"{self.path} lists no pair; wanted lines of `source,target`")
-        self.names = tuple(f"{source} -> {target}" for source, target, _ in self._rows)
+        self.names: tuple[str, ...] = tuple(
+            f"{source} -> {target}" for source, target, _ in self._rows
+        )
 
     @property
     def listed(self) -> list[tuple[str, str]]:
@@ -151,7 +153,9 @@ class Hdf5Pairs(PairFile):
         super().__init__(path)
         try:
             with h5py.File(self.path, "r") as file:
-                self.names = tuple(sorted(k for k, v in file.items() if isinstance(v, h5py.Group)))
+                self.names: tuple[str, ...] = tuple(
+                    sorted(k for k, v in file.items() if isinstance(v, h5py.Group))
+                )
         except OSError as error:
             raise ValueError(f"{self.path} is not an HDF5 file ({error})") from error
         if not self.names:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class TrainingSource(Source, Protocol):
         neighbors: int,
         radius: float,
         rng: np.random.Generator,
-    ) -> dict:
+    ) -> dict[str, Any]:
         """A pair of item `index` to validate on, as `augment.finish_pair` gives it."""
         ...
 
@@ -76,7 +76,7 @@ class ShapeSource:
         digest.update(self.corpus.points[:, ::64].tobytes())
         return digest.hexdigest()
 
-    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
+    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
         """Each cloud is a crop and a draw of points of its own."""
         points, normals = self.corpus[index]
         uneven = rng.random() < sampling.uneven
@@ -94,7 +94,7 @@ class ShapeSource:
         neighbors: int,
         radius: float,
         rng: np.random.Generator,
-    ) -> dict:
+    ) -> dict[str, Any]:
         """By the published partial protocol, 717 points; nothing else decides about it."""
         pair = protocol.fixed_pair(self.corpus, index, protocol.partial)
         made = {"transform": pair.transform, "estimate_normals": False}

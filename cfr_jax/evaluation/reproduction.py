@@ -12,6 +12,7 @@ from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.pairs import Pair
 from cfr_jax.data.protocol import Protocol, fixed_pair, partial
 from cfr_jax.evaluation import metrics
+from cfr_jax.networks.record import Params
 from cfr_jax.weights.cards import FOLDER
 
 SHAPES = FOLDER / "held_out.npz"
@@ -52,7 +53,7 @@ def make_pairs(count: int = PAIRS, protocol: Protocol = partial) -> list[Pair]:
     return [fixed_pair(shapes.take(rows), index, protocol) for index in range(count)]
 
 
-def measure(params: dict, told: Callable[[], Any] = lambda: None, count: int = PAIRS) -> Scores:
+def measure(params: Params, told: Callable[[], Any] = lambda: None, count: int = PAIRS) -> Scores:
     """Scores of the network alone and refined; `told` is called after every pair.
 
     Pairs without an answer count as turned by 180 degrees.

@@ -22,7 +22,7 @@ class Record:
 
     pair: str
     """Digest of the pair, so that a changed pair is solved again."""
-    transforms: list | None = None
+    transforms: list[Any] | None = None
     """(i, 4, 4), one per iteration."""
     seconds: float | None = None
     failure: str | None = None

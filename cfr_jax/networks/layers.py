@@ -6,7 +6,7 @@ and variance one. Flax's own takes the first axis for a batch and knows no mask.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ EPSILON = 1e-5
 GROUPS = 8  # of the channels, in most layers of the published networks
 
 # What PyTorch's Linear starts from, as the published networks did.
-kernel_init = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+kernel_init: Final = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 
 
 class Layer(NamedTuple):

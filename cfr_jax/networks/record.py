@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from jaxtyping import Array, Float
 
@@ -26,8 +26,11 @@ class Step(NamedTuple):
     affinity: Affinity
 
 
+Params: TypeAlias = dict[str, Any]
+"""The parameters of a network: a pytree of float32 arrays, named by the keys of nested dicts."""
+
 # Each network has a type of settings of its own, so to this table they are any.
-Unroll = Callable[[dict, Cloud, Cloud, Any], Iterable[Step]]
+Unroll = Callable[[Params, Cloud, Cloud, Any], Iterable[Step]]
 """The iterations of a network: parameters, source, target and settings in, one `Step` each out."""
 
 
@@ -36,7 +39,7 @@ class Part(NamedTuple):
 
     module: str
     function: Callable[..., Any]
-    arguments: tuple
+    arguments: tuple[Any, ...]
     times: int = 1
 
 
@@ -92,7 +95,7 @@ class Network:
     settings: type
     """Frozen dataclass of what changes the compiled program. Its `neighbors` and `radius` say how
     clouds are prepared. One that has a field `activations` can be trained in "bfloat16"."""
-    fresh: Callable[..., dict]
+    fresh: Callable[..., Params]
     """`fresh(key, iterations=..., **variant)`: new parameters, a pytree of float32 arrays. What
     parameters do not depend on, it takes and ignores."""
     unroll: Unroll
@@ -104,7 +107,7 @@ class Network:
     """Settings of a training, by the number of neighbors and of iterations."""
     validated: Any
     """Settings by which a training is validated."""
-    iterations: Callable[[dict], int] | None = None
+    iterations: Callable[[Params], int] | None = None
     """How many iterations parameters were made for; None where parameters do for any number."""
     variants: tuple[str, ...] = ()
     """Fields of a training's config, beside `iterations`, that `fresh` takes as well."""
@@ -112,7 +115,7 @@ class Network:
     """Fields of the settings that `config.settings` of a training may change."""
     own_neighbors: bool = False
     """Whether it searches its neighbors itself, and needs those of a prepared cloud for nothing."""
-    parts: Callable[[dict, Any], Callable[[Cloud, Cloud], Iterator[Part]]] | None = None
+    parts: Callable[[Params, Any], Callable[[Cloud, Cloud], Iterator[Part]]] | None = None
     """From parameters and settings: what makes the parts of a registration for timing."""
     checkpoint: Checkpoint | None = None
     """What `cfr convert` reads; None where nothing is published, or nothing is read of it."""

@@ -33,7 +33,7 @@ from cfr_jax.networks.parts import (
     matching,
     move,
 )
-from cfr_jax.networks.record import Checkpoint, Network, Part, Place, Step, places_of
+from cfr_jax.networks.record import Checkpoint, Network, Params, Part, Place, Step, places_of
 from cfr_jax.networks.sinkhorn import Affinity, Form, match
 
 _WIDTHS = (96, 96, 192)
@@ -100,21 +100,23 @@ class RPMNet(nn.Module):
     """The two learned parts, shared by all iterations."""
 
     def setup(self) -> None:
-        self.features = Features()
-        self.annealing = AnnealingNet(iterations=1)
+        self.features: Features = Features()
+        self.annealing: AnnealingNet = AnnealingNet(iterations=1)
 
     def __call__(self, raw: Array, source: Array, target: Array) -> object:
         """Touches every part once, so that `init` makes all parameters."""
         return self.features(raw), self.annealing(source, target)
 
 
-def init_params(key: jax.Array, iterations: int | None = None) -> dict:
+def init_params(key: jax.Array, iterations: int | None = None) -> Params:
     """Fresh parameters, a pytree of float32 arrays; any number of `iterations` shares them."""
     points, raw = jnp.zeros((2, 3)), jnp.zeros((2, 1, _RAW_CHANNELS))
     return RPMNet().init(key, raw, points, points)["params"]
 
 
-def unroll(params: dict, source: Cloud, target: Cloud, settings: RPMNetSettings) -> Iterator[Step]:
+def unroll(
+    params: Params, source: Cloud, target: Cloud, settings: RPMNetSettings
+) -> Iterator[Step]:
     """The iterations, one by one; the clouds' `neighbors` are not used.
 
     As published, no gradient flows through the motion between two iterations.
@@ -144,7 +146,7 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: RPMNetSettings)
         moved = moved_by(lax.stop_gradient(transform), source)
 
 
-def bind(params: dict) -> RPMNet:
+def bind(params: Params) -> RPMNet:
     """The network with its parameters inside."""
     return RPMNet().bind({"params": params})
 
@@ -162,7 +164,7 @@ def extract(network: RPMNet, cloud: Cloud, neighbors: Int32[Array, "n k"]) -> Fl
     return network.features(raw, cloud.mask)
 
 
-def parts(params: dict, settings: RPMNetSettings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
+def parts(params: Params, settings: RPMNetSettings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
     """All parts of the registration of two clouds, for timing."""
     network, count = bind(params), settings.iterations
     search = jax.jit(lambda cloud: find_neighbors(cloud, settings))

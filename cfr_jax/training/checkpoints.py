@@ -46,10 +46,11 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, keep: int):
-        self.folder, self._keep = Path(folder).absolute(), keep
+        self.folder: Path = Path(folder).absolute()
+        self._keep = keep
         self._writer = ocp.StandardCheckpointer()
         self._thread = ThreadPoolExecutor(1)
-        self._running: Future | None = None
+        self._running: Future[None] | None = None
         if is_first():
             self.folder.mkdir(parents=True, exist_ok=True)
             shutil.rmtree(self.folder / _UNFINISHED, ignore_errors=True)
@@ -73,7 +74,7 @@ class Checkpoints:
     def save(
         self,
         state: TrainState,
-        about: dict,
+        about: dict[str, Any],
         best: int | None = None,
         then: Callable[[TrainState], None] | None = None,
     ) -> None:
@@ -103,7 +104,7 @@ class Checkpoints:
         if running is not None:
             running.result()
 
-    def restore(self, like: TrainState) -> tuple[TrainState, dict] | None:
+    def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]] | None:
         """The newest sound state and what was said about it; None if nothing was ever saved.
 
         Warns of each damaged one. Raises ValueError where all are damaged, each time anew, and
@@ -174,7 +175,7 @@ class Checkpoints:
         ) from error
 
 
-def _after(saved: Future, then: Callable[[TrainState], None], state: TrainState) -> None:
+def _after(saved: Future[None], then: Callable[[TrainState], None], state: TrainState) -> None:
     saved.result()
     if is_first():
         then(state)

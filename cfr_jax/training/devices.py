@@ -82,7 +82,7 @@ def share_of(size: int) -> slice:
     return slice(jax.process_index() * mine, (jax.process_index() + 1) * mine)
 
 
-def spread(batch: dict, mesh: Mesh) -> dict:
+def spread(batch: dict[str, np.ndarray], mesh: Mesh) -> dict[str, jax.Array]:
     """A batch over the devices; each process gives the rows that `share_of` told it."""
     rows = NamedSharding(mesh, P(AXIS))
     return {key: jax.make_array_from_process_local_data(rows, batch[key]) for key in batch}

@@ -23,7 +23,7 @@ WEIGHTS = "weights.safetensors"  # the best so far
 _KEPT = ("step", "steps", "best", "validation", "position", "clock", "skipped")
 
 
-def begin(config: TrainingConfig, stamps: dict[str, str]) -> dict:
+def begin(config: TrainingConfig, stamps: dict[str, str]) -> dict[str, Any]:
     """What a checkpoint says of itself, before the first step."""
     versions = {name: importlib.metadata.version(name) for name in _NAMED}
     versions |= {"cfr_jax": __version__, "python": platform.python_version()}
@@ -44,7 +44,7 @@ def begin(config: TrainingConfig, stamps: dict[str, str]) -> dict:
     }
 
 
-def go_on(before: dict, now: dict, total: int, workdir: Path) -> list[str]:
+def go_on(before: dict[str, Any], now: dict[str, Any], total: int, workdir: Path) -> list[str]:
     """Takes over into `now` what a checkpoint says; words about where it goes on, and what changed.
 
     The best validation is forgotten where others follow on other pairs: they do not compare.
@@ -71,7 +71,7 @@ def go_on(before: dict, now: dict, total: int, workdir: Path) -> list[str]:
     return told
 
 
-def notes(config: TrainingConfig, best: dict) -> dict[str, str]:
+def notes(config: TrainingConfig, best: dict[str, Any]) -> dict[str, str]:
     """What a weights file says of its own making."""
     return {
         "config": json.dumps(dataclasses.asdict(config), sort_keys=True),
@@ -80,7 +80,7 @@ def notes(config: TrainingConfig, best: dict) -> dict[str, str]:
     }
 
 
-def holds(file: Path, best: dict) -> bool:
+def holds(file: Path, best: dict[str, Any]) -> bool:
     """Whether this weights file is there, sound, and that of the validation `best`."""
     try:
         return weights.read_weights(file).notes.get("validation") == json.dumps(best)
@@ -88,7 +88,7 @@ def holds(file: Path, best: dict) -> bool:
         return False
 
 
-def _changes(before: dict, now: dict) -> Iterator[str]:
+def _changes(before: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
     then, here = dict(_flat(before)), dict(_flat(now))
     for name in sorted(then.keys() | here.keys()):
         if then.get(name) != here.get(name):

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from cfr_jax.weights import files as weights
 _TRAINED = 0.97  # of the time left; the rest is for validations and checkpoints
 
 
-def run(config: TrainingConfig, workdir: Path) -> dict:
+def run(config: TrainingConfig, workdir: Path) -> dict[str, Any]:
     """Trains by `config` in `workdir`, going on where a checkpoint there left off.
 
     Writes `checkpoints/`, `metrics.jsonl` (a line each time something is measured),
@@ -70,7 +71,7 @@ class _Training:
     workdir: Path
     task: Task
     state: TrainState
-    about: dict
+    about: dict[str, Any]
     checkpoints: Checkpoints
     reports: Reporter
     drawing: Drawing
@@ -165,7 +166,7 @@ class _Training:
         if self.about["best"].get("step") == self.about["step"] and devices.is_first():
             self._write_best(self.about["best"], self.state)
 
-    def _write_best(self, best: dict, state: TrainState) -> None:
+    def _write_best(self, best: dict[str, Any], state: TrainState) -> None:
         """The weights of a state whose validation is `best`. In the middle of a training this is
         done beside it, once the checkpoint is there that calls them so."""
         file = self.workdir / identity.WEIGHTS

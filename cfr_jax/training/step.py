@@ -18,7 +18,7 @@ from cfr_jax.data.augment import Sampling
 from cfr_jax.data.device_pairs import Shapes, draw_pairs
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks.inputs import Cloud
-from cfr_jax.networks.record import Unroll
+from cfr_jax.networks.record import Params, Unroll
 from cfr_jax.training.devices import AXIS
 from cfr_jax.training.losses import PairLoss, pair_loss
 
@@ -35,8 +35,8 @@ class TrainState:
     """All that a step changes."""
 
     step: Int[Array, ""]
-    params: dict
-    average: dict
+    params: Params
+    average: Params
     """Exponential moving average of the parameters: what is validated and shipped."""
     optimizer: optax.OptState
     skipped: Int[Array, ""]
@@ -61,7 +61,7 @@ class Recipe:
     """How many steps in a row may be left out; after more, nothing changes any more."""
 
 
-def init_state(params: dict, optimizer: optax.GradientTransformation) -> TrainState:
+def init_state(params: Params, optimizer: optax.GradientTransformation) -> TrainState:
     """A state at step zero; the average starts as a copy, since the step donates both."""
     return TrainState(
         step=jnp.zeros((), jnp.int32),
@@ -74,7 +74,9 @@ def init_state(params: dict, optimizer: optax.GradientTransformation) -> TrainSt
 
 
 @functools.partial(jax.jit, static_argnames=("recipe",), donate_argnames=("state",))
-def train_step(state: TrainState, batch: dict, *, recipe: Recipe) -> tuple[TrainState, PairLoss]:
+def train_step(
+    state: TrainState, batch: dict[str, Array], *, recipe: Recipe
+) -> tuple[TrainState, PairLoss]:
     """One step on a batch of `data.batches`, its losses and errors pair by pair.
 
     The pairs are spread evenly over the mesh. A device accumulates the gradient of its share,
@@ -154,11 +156,11 @@ def _advance(
 
 
 def _mean_gradient(
-    params: dict, batch: dict[str, Array], *, recipe: Recipe
-) -> tuple[dict, PairLoss]:
+    params: Params, batch: dict[str, Array], *, recipe: Recipe
+) -> tuple[Params, PairLoss]:
     """The gradient of the mean loss over all devices, from this device's pairs of the batch."""
 
-    def loss(params: dict, pair: dict[str, Array]) -> tuple[Array, PairLoss]:
+    def loss(params: Params, pair: dict[str, Array]) -> tuple[Array, PairLoss]:
         source, target = (_cloud(pair, side) for side in ("source", "target"))
         measured = pair_loss(
             recipe.unroll(params, source, target, recipe.settings),
@@ -173,7 +175,7 @@ def _mean_gradient(
     size = len(batch["transform"])
     at_once = min(recipe.pairs_at_once, size)
 
-    def add(total: dict, pairs: dict[str, Array]) -> tuple[dict, PairLoss]:
+    def add(total: Params, pairs: dict[str, Array]) -> tuple[Params, PairLoss]:
         if at_once == 1:  # a batch axis of one would send XLA's products down a slower path
             gradient, measured = gradient_of(params, jax.tree.map(lambda leaf: leaf[0], pairs))
             measured = jax.tree.map(lambda leaf: leaf[None], measured)
@@ -203,8 +205,8 @@ def _cloud(pair: dict[str, Array], side: str) -> Cloud:
 
 @functools.partial(jax.jit, static_argnames=("unroll", "settings", "mesh", "pairs_at_once"))
 def predict(
-    params: dict,
-    batch: dict,
+    params: Params,
+    batch: dict[str, Array],
     *,
     unroll: Unroll,
     settings: Hashable,
@@ -214,11 +216,11 @@ def predict(
     """Transforms (b, L, 4, 4) of a batch that needs no training; each device takes its share,
     `pairs_at_once` pairs vectorized and the rest one after the other, all in float32."""
 
-    def of_pair(params: dict, pair: dict[str, Array]) -> Array:
+    def of_pair(params: Params, pair: dict[str, Array]) -> Array:
         source, target = (_cloud(pair, side) for side in ("source", "target"))
         return jnp.stack([step.transform for step in unroll(params, source, target, settings)])
 
-    def of_share(params: dict, pairs: dict[str, Array]) -> Array:
+    def of_share(params: Params, pairs: dict[str, Array]) -> Array:
         size = len(pairs["transform"])
         return jax.lax.map(
             functools.partial(of_pair, params),

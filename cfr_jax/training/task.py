@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.sharding import Mesh
 
@@ -20,6 +21,7 @@ from cfr_jax.data.mixture import (
     open_mixture,
 )
 from cfr_jax.networks.probability import uncalibrated
+from cfr_jax.networks.record import Params
 from cfr_jax.training import devices, optimizers
 from cfr_jax.training.config import Phase, TrainingConfig, checked
 from cfr_jax.training.learner import Learner, learner
@@ -36,7 +38,7 @@ class Task:
     samplings: tuple[Sampling, ...]
     """One of each phase."""
     mixture: Mixture
-    pairs: dict
+    pairs: dict[str, np.ndarray]
     """What is validated on, as one batch."""
     schedule: optax.Schedule
     optimizer: optax.GradientTransformation
@@ -112,7 +114,7 @@ def prepare(config: TrainingConfig, workdir: Path) -> Task:
     )
 
 
-def fresh_params(config: TrainingConfig, chosen: Learner) -> dict:
+def fresh_params(config: TrainingConfig, chosen: Learner) -> Params:
     """The weights that a run begins with: those of `train.start_from`, or random ones.
 
     Raises ValueError where those do not have the iterations that the config asks for.

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
 from cfr_jax.evaluation import metrics
+from cfr_jax.networks.record import Params
 from cfr_jax.training import devices, step, stopping
 from cfr_jax.training.learner import Learner
 
 _RECALL = 5.0, 0.1  # degrees, and radii
 
 
-def place(batch: dict, mesh: Mesh, pairs_at_once: int = 1) -> dict:
+def place(batch: dict[str, np.ndarray], mesh: Mesh, pairs_at_once: int = 1) -> dict[str, jax.Array]:
     """The pairs of `mixture.fixed_pairs` over the devices, the last one repeated to fill them,
     `pairs_at_once` (or all, if they are fewer) in each."""
     count = len(batch["transform"])
@@ -26,12 +29,12 @@ def place(batch: dict, mesh: Mesh, pairs_at_once: int = 1) -> dict:
 
 def validate(
     chosen: Learner,
-    params: dict,
-    placed: dict,
+    params: Params,
+    placed: dict[str, jax.Array],
     truth: np.ndarray,
     mesh: Mesh,
     pairs_at_once: int = 1,
-) -> dict:
+) -> dict[str, Any]:
     """Rotation (degrees) and translation errors of the last transform against `truth` (b, 4, 4),
     their recall, and the mean rotation error of every iteration; and all transforms (b, L, 4, 4).
 
@@ -68,7 +71,7 @@ def validate(
     }
 
 
-def in_words(found: dict) -> str:
+def in_words(found: dict[str, Any]) -> str:
     """A validation, as people read it."""
     return (
         f"validation RE {found['rotation_mean']:.2f}° mean, "

@@ -19,10 +19,10 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors.numpy import load_file
 
 from cfr_jax.networks import table
-from cfr_jax.networks.record import Checkpoint, Network
+from cfr_jax.networks.record import Checkpoint, Network, Params
 
 
-def convert(path: str | Path) -> dict:
+def convert(path: str | Path) -> Params:
     """Parameters from a checkpoint of a network's authors: CFR or RPM-Net.
 
     Its names tell which of the two it is; `weights.files.network_of` says which it was. `path` is a
@@ -53,7 +53,7 @@ def convert(path: str | Path) -> dict:
     return from_state_dict(state, str(path))
 
 
-def from_state_dict(state: dict[str, np.ndarray], name: str = "state_dict") -> dict:
+def from_state_dict(state: dict[str, np.ndarray], name: str = "state_dict") -> Params:
     """`convert` for tensors that are already in memory, as arrays; `name` stands in errors."""
     record, checkpoint = _recognized(state, name)
     places = checkpoint.places(state)

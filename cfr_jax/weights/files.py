@@ -19,7 +19,7 @@ from safetensors.numpy import save
 from cfr_jax.networks import table
 from cfr_jax.networks.clues import NetworkClues
 from cfr_jax.networks.probability import KEY, Calibration, calibration_of, uncalibrated
-from cfr_jax.networks.record import Network
+from cfr_jax.networks.record import Network, Params
 from cfr_jax.runtime.atomic import write_atomically
 
 SHIPPED = Path(__file__).parent / "shipped"
@@ -34,7 +34,7 @@ class NoWeights(ValueError):
 class Weights:
     """Parameters and where they come from."""
 
-    params: dict
+    params: Params
     """With their calibration, where the file has one (`networks.probability`)."""
     name: str
     network: str
@@ -45,7 +45,7 @@ class Weights:
     """Whatever else the file says of them."""
 
 
-def save_params(path: str | Path, params: dict, notes: dict[str, str] | None = None) -> None:
+def save_params(path: str | Path, params: Params, notes: dict[str, str] | None = None) -> None:
     """Writes parameters and notes about them (strings), beside first and then renamed.
 
     The calibration of the parameters, if they have one, becomes a note, too. Raises OSError, naming
@@ -64,7 +64,7 @@ def save_params(path: str | Path, params: dict, notes: dict[str, str] | None = N
         raise OSError(f"weights: {path} could not be written ({error})") from error
 
 
-def load_params(source: str | Path = DEFAULT, network: str = "cfr") -> dict:
+def load_params(source: str | Path = DEFAULT, network: str = "cfr") -> Params:
     """Parameters that ship with the package, by name, or of a .safetensors file, by path.
 
     A pytree of float32 arrays for `register`, or for the `unroll` of another `network` of the
@@ -81,7 +81,7 @@ def shipped() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
 
 
-def network_of(params: dict) -> str:
+def network_of(params: Params) -> str:
     """The name of the network that parameters are made for, told by theirs."""
     return table.recognize(_flat(params)).name
 

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from cfr_jax.networks.cfr.registration import register
 from cfr_jax.networks.inputs import Settings, prepare
+from cfr_jax.networks.record import Params
 from cfr_jax.runtime.atomic import write_atomically
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -29,7 +30,7 @@ OUTPUTS = ("transform", "transforms", "weights", "covered")
 
 
 def export_register(
-    params: dict,
+    params: Params,
     *,
     points: int,
     platforms: Sequence[str] = ("cpu",),

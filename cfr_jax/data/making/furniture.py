@@ -52,7 +52,7 @@ class FurnitureLibrary:
             text = self._zip.read(CATALOGUE).decode("latin1")
         except (OSError, zipfile.BadZipFile, KeyError) as error:
             raise ValueError(f"{path} is not a furniture library (SH3F): {error}") from error
-        self.pieces = _pieces(text, path)
+        self.pieces: tuple[Piece, ...] = _pieces(text, path)
 
     def __enter__(self) -> FurnitureLibrary:
         return self

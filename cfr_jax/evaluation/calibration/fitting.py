@@ -23,6 +23,7 @@ from cfr_jax.evaluation import metrics
 from cfr_jax.evaluation.calibration.trials import Trial, Trials
 from cfr_jax.networks.cfr.registration import Registration, register
 from cfr_jax.networks.probability import BIAS, KEY, Calibration, calibration_of, uncalibrated
+from cfr_jax.networks.record import Params
 from cfr_jax.weights.files import load_params
 
 USED = {"register": confidence.OF_NETWORK, "align": confidence.NAMES}
@@ -44,7 +45,7 @@ class Gathered:
 
 
 def gather(
-    params: dict,
+    params: Params,
     trials: Trials,
     count: int,
     *,
@@ -133,7 +134,7 @@ def predicted(calibration: Calibration, found: Gathered, name: str) -> Float[np.
     return predict(np.array([*weights, fitted[BIAS]]), found.clues[name])
 
 
-def _row(params: dict, trial: Trial) -> list[float]:
+def _row(params: Params, trial: Trial) -> list[float]:
     """The clues of both answers to a trial, whether each is right, and the trial's group."""
     found = align(
         trial.source, trial.target, params=params, initial="global" if trial.searched else None
@@ -167,7 +168,7 @@ def is_right(
 
 @jax.jit
 def _register(
-    params: dict, source: solving.DeviceCloud, target: solving.DeviceCloud
+    params: Params, source: solving.DeviceCloud, target: solving.DeviceCloud
 ) -> Registration:
     return register(params, source.prepared(), target.prepared(), settings=SETTINGS)
 

@@ -24,7 +24,7 @@ from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks import table
 from cfr_jax.networks.inputs import Cloud, Settings, moved_by
-from cfr_jax.networks.record import Network
+from cfr_jax.networks.record import Network, Params
 from cfr_jax.refine import Refinement, find
 from cfr_jax.runtime import programs
 from cfr_jax.weights.files import load_params
@@ -96,7 +96,7 @@ def make_network(
 
 
 def _align_each(
-    params: dict, refine: bool | str, estimated: bool, pairs: Sequence[Pair], **options: Any
+    params: Params, refine: bool | str, estimated: bool, pairs: Sequence[Pair], **options: Any
 ) -> list[Answer]:
     answers = []
     for pair in pairs:
@@ -109,7 +109,7 @@ def _align_each(
 
 
 def _prepare_each(
-    params: dict,
+    params: Params,
     program: Program,
     estimated: bool,
     max_points: int | None,
@@ -138,7 +138,7 @@ def _prepare_each(
 
 
 def _register_batches(
-    params: dict, program: Program, estimated: bool, size: int, pairs: Sequence[Pair]
+    params: Params, program: Program, estimated: bool, size: int, pairs: Sequence[Pair]
 ) -> list[Answer]:
     """Clouds of different sizes go into different batches; a short batch repeats its last pair."""
     rows = defaultdict(list)
@@ -187,7 +187,7 @@ def _stacked(program: Program, pairs: Sequence[Pair], estimated: bool) -> list[C
 
 
 def _run(
-    program: Program, params: dict, sources: Cloud, targets: Cloud
+    program: Program, params: Params, sources: Cloud, targets: Cloud
 ) -> tuple[Float[np.ndarray, "b i 4 4"], float]:
     """Motions of a batch in host memory, and the seconds of it that were compilation."""
     began = time.perf_counter()
@@ -199,7 +199,7 @@ def _run(
 
 @functools.partial(jax.jit, static_argnames=("program",))
 def _solve(
-    params: dict, sources: Cloud, targets: Cloud, *, program: Program
+    params: Params, sources: Cloud, targets: Cloud, *, program: Program
 ) -> Float[Array, "b i 4 4"]:
     def of_pair(pair: tuple[Cloud, Cloud]) -> Array:
         source, target = (_with_normals(cloud) for cloud in pair)
@@ -215,7 +215,7 @@ def _solve(
 
 
 def _transforms(
-    program: Program, params: dict, source: Cloud, target: Cloud
+    program: Program, params: Params, source: Cloud, target: Cloud
 ) -> Float[Array, "i 4 4"]:
     """Of all cascades, each started where the one before it ended."""
 

@@ -17,7 +17,7 @@ from cfr_jax.geometry import rigid
 from cfr_jax.networks.cfr.modules import CFR
 from cfr_jax.networks.features import raw_features
 from cfr_jax.networks.inputs import Cloud, Settings, moved_by
-from cfr_jax.networks.record import Step
+from cfr_jax.networks.record import Params, Step
 from cfr_jax.networks.sinkhorn import Affinity, match
 
 
@@ -30,7 +30,7 @@ class Encoded:
 
 
 def iterate(
-    params: dict, source: Cloud, target: Encoded, iterations: int, settings: Settings
+    params: Params, source: Cloud, target: Encoded, iterations: int, settings: Settings
 ) -> Iterator[Step]:
     """The iterations of `register`, one by one, for those who need what lies between (the loss).
 
@@ -74,7 +74,7 @@ def moved_on(transform: Float[Array, "4 4"], source: Cloud, settings: Settings) 
     return moved_by(lax.stop_gradient(transform) if settings.detach_motion else transform, source)
 
 
-def encoded(params: dict, cloud: Cloud, settings: Settings) -> Encoded:
+def encoded(params: Params, cloud: Cloud, settings: Settings) -> Encoded:
     """The features of a reference in every iteration."""
     network = bind(params)
     heavy = heavy_features(network, cloud, settings)
@@ -85,18 +85,18 @@ def encoded(params: dict, cloud: Cloud, settings: Settings) -> Encoded:
     return Encoded(cloud, network.cascade.at_rest(heavy, cloud.points, cloud.mask))
 
 
-def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> Iterator[Step]:
+def unroll(params: Params, source: Cloud, target: Cloud, settings: Settings) -> Iterator[Step]:
     """The iterations that the parameters were made for, both clouds given as they are."""
     reference = encoded(params, target, settings)
     return iterate(params, source, reference, iterations_of(params), settings)
 
 
-def iterations_of(params: dict) -> int:
+def iterations_of(params: Params) -> int:
     """L, the number of iterations that the parameters were made for."""
     return params["annealing"]["out"]["bias"].shape[0] // 2
 
 
-def bind(params: dict) -> CFR:
+def bind(params: Params) -> CFR:
     """The network with its parameters inside."""
     shared = params["cascade"]["kernel"].shape[0] == 1
     return CFR(iterations_of(params), shared).bind({"params": params})

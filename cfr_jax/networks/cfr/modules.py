@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from cfr_jax.networks.annealing import AnnealingNet
 from cfr_jax.networks.extraction import Activations, pooled_features
 from cfr_jax.networks.layers import GROUPS, Layer, group_norm, kernel_init, unit_rows
+from cfr_jax.networks.record import Params
 
 CHANNELS = 96
 RAW_CHANNELS = 7
@@ -61,11 +62,11 @@ class Cascade(nn.Module):
 
     def setup(self) -> None:
         count, d = 1 if self.shared else self.iterations, CHANNELS
-        self.position = self.param("position", _stacked_init, (count, 3, d))
-        self.scale = self.param("scale", nn.initializers.ones, (count, d))
-        self.shift = self.param("shift", nn.initializers.zeros, (count, d))
-        self.kernel = self.param("kernel", _stacked_init, (count, d, d))
-        self.bias = self.param("bias", nn.initializers.zeros, (count, d))
+        self.position: Array = self.param("position", _stacked_init, (count, 3, d))
+        self.scale: Array = self.param("scale", nn.initializers.ones, (count, d))
+        self.shift: Array = self.param("shift", nn.initializers.zeros, (count, d))
+        self.kernel: Array = self.param("kernel", _stacked_init, (count, d, d))
+        self.bias: Array = self.param("bias", nn.initializers.zeros, (count, d))
 
     def layer(
         self,
@@ -101,9 +102,9 @@ class CFR(nn.Module):
     shared: bool = False
 
     def setup(self) -> None:
-        self.features = PointFeatures()
-        self.cascade = Cascade(self.iterations, self.shared)
-        self.annealing = AnnealingNet(self.iterations)
+        self.features: PointFeatures = PointFeatures()
+        self.cascade: Cascade = Cascade(self.iterations, self.shared)
+        self.annealing: AnnealingNet = AnnealingNet(self.iterations)
 
     def __call__(self, raw: Array, source: Array, target: Array) -> object:
         """Touches every part once, so that `init` makes all parameters."""
@@ -111,7 +112,7 @@ class CFR(nn.Module):
         return self.cascade.at_rest(features, source), self.annealing(source, target)
 
 
-def init_params(key: jax.Array, iterations: int = 5, shared: bool = False) -> dict:
+def init_params(key: jax.Array, iterations: int = 5, shared: bool = False) -> Params:
     """Fresh parameters, a pytree of float32 arrays; `shared`: one light layer for all of them."""
     points, raw = jnp.zeros((2, 3)), jnp.zeros((2, 1, RAW_CHANNELS))
     return CFR(iterations, shared).init(key, raw, points, points)["params"]

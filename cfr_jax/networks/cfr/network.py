@@ -24,7 +24,7 @@ from cfr_jax.networks.parts import (
     move,
     on_host,
 )
-from cfr_jax.networks.record import Checkpoint, Network, Part, Place, places_of
+from cfr_jax.networks.record import Checkpoint, Network, Params, Part, Place, places_of
 
 _LAYERS = (
     *AUTHORS_LAYERS,
@@ -76,7 +76,7 @@ def _places(tensors: Collection[str]) -> dict[str, Place]:
     return found
 
 
-def parts(params: dict, settings: Settings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
+def parts(params: Params, settings: Settings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
     """All parts of the registration of two clouds, for timing."""
     network, count = bind(params), iterations_of(params)
     heavy = jax.jit(lambda cloud: heavy_features(network, cloud, settings))

@@ -22,6 +22,7 @@ from cfr_jax.networks.cfr.iterations import Encoded, encoded, iterate, iteration
 from cfr_jax.networks.clues import NetworkClues, of_network, of_registration
 from cfr_jax.networks.inputs import Cloud, Settings, check_points, prepare
 from cfr_jax.networks.probability import calibration_of
+from cfr_jax.networks.record import Params
 
 
 @struct.dataclass
@@ -54,7 +55,7 @@ class Registration:
 
 
 def encode(
-    params: dict, target: Float[Array, "m c"] | Cloud, *, settings: Settings = Settings()
+    params: Params, target: Float[Array, "m c"] | Cloud, *, settings: Settings = Settings()
 ) -> Encoded:
     """The features of a reference in every iteration; hand it to `register` as the target, with the
     same settings. Raises ValueError as `register` does."""
@@ -66,12 +67,12 @@ def encode(
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
-def _encode(params: dict, target: Array | Cloud, *, settings: Settings) -> Encoded:
+def _encode(params: Params, target: Array | Cloud, *, settings: Settings) -> Encoded:
     return encoded(params, _prepared("target", target, settings), settings)
 
 
 def register(
-    params: dict,
+    params: Params,
     source: Float[Array, "n c"] | Cloud,
     target: Float[Array, "m c"] | Cloud | Encoded,
     *,
@@ -102,7 +103,7 @@ def register(
 
 @functools.partial(jax.jit, static_argnames=("iterations", "cascades", "settings"))
 def _register(
-    params: dict,
+    params: Params,
     source: Array | Cloud,
     target: Array | Cloud | Encoded,
     *,

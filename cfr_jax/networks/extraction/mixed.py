@@ -31,7 +31,6 @@ _Kept = tuple[
 """Means and a covariance, norms, what was pooled, and the layers' inputs and outputs."""
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
 def pooled_mixed(
     layers: tuple[Layer, Layer, Layer],
     raw: Float[Array, "n k c"],
@@ -41,6 +40,11 @@ def pooled_mixed(
 ) -> Float[Array, "n d"]:
     """`extraction.pooled_features` of the points that are `valid` (1, or 0), before the others are
     set to zero. Differentiates by its own rule, once. `stored` is what activations are kept in."""
+    return _pooled(layers, raw, valid, groups, stored)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _pooled(layers: _Layers, raw: Array, valid: Array, groups: int, stored: DTypeLike) -> Array:
     return _forward(layers, raw, valid, groups, stored)[0]
 
 
@@ -137,7 +141,7 @@ def _backward(
     return gradients, d_raw, jnp.zeros_like(valid)
 
 
-pooled_mixed.defvjp(_forward, _backward)
+_pooled.defvjp(_forward, _backward)
 
 
 def _moments_of_raw(raw: Array, valid: Array, count: Array) -> tuple[Array, Array]:

@@ -9,6 +9,7 @@ GPU's kernel, `log_space` is the published one that they are compared with.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 from jaxtyping import Array, Bool, Float
@@ -91,7 +92,7 @@ def _match_by_size(affinity: Affinity, points: Array, **rest: Any) -> Match:
     return _by_hand(affinity, points, ways, **rest)
 
 
-FORMS = {
+FORMS: dict[Form, Callable[..., Match]] = {
     "dense": match_dense,
     "streamed": _match_streamed,
     "fused": _match_fused,

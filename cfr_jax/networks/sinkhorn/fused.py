@@ -42,12 +42,15 @@ class Fused:
         *,
         rows: int,
     ):
-        self.affinity, self.size = affinity, rows
+        self.affinity: Affinity = affinity
+        self.size: int = rows
         # what a log affinity is lessened by: all of it, where masked
-        self.less = [jnp.where(mask, 0, jnp.inf).astype(affinity.beta.dtype) for mask in masks]
+        self.less: list[Array] = [
+            jnp.where(mask, 0, jnp.inf).astype(affinity.beta.dtype) for mask in masks
+        ]
         if shift is None:
             shift = jnp.maximum(self._run(_highest, (), flip=False, sums=1)[0][:, 0], 0)
-        self.shift = shift
+        self.shift: Array = shift
         self.less[0] += shift
 
     def rows(self, right: Float[Array, "m c"]) -> Float[Array, "n c"]:

@@ -106,11 +106,11 @@ class Stored:
         masks: tuple[Bool[Array, " n"], Bool[Array, " m"]],
         shift: Float[Array, " n"] | None = None,
     ):
-        self.affinity = affinity
-        self.square = squared_distances(affinity.source, affinity.target)
+        self.affinity: Affinity = affinity
+        self.square: Array = squared_distances(affinity.source, affinity.target)
         log_values = masked(log_affinity(self.square, affinity.beta, affinity.alpha), *masks)
-        self.shift = jnp.maximum(jnp.max(log_values, axis=1), 0) if shift is None else shift
-        self.block = jnp.exp(log_values - self.shift[:, None])
+        self.shift: Array = jnp.maximum(jnp.max(log_values, axis=1), 0) if shift is None else shift
+        self.block: Array = jnp.exp(log_values - self.shift[:, None])
 
     def rows(self, right: Float[Array, "m c"]) -> Float[Array, "n c"]:
         return jnp.matmul(self.block, right, precision=_HIGHEST)

@@ -6,6 +6,7 @@ import functools
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +37,7 @@ class DeviceDrawing:
         self._steps, self._seed, self._mesh = config.train.steps_at_once, config.seed, mesh
         shapes, self._rows = _shapes(mixture)
         self._on_device = devices.replicate((shapes, np.uint32(config.seed % 2**32)), mesh)
-        self._programs: dict[tuple, Future] = {}
+        self._programs: dict[tuple[Any, ...], Future[jax.stages.Compiled]] = {}
 
     def begin(self, leg: Leg, state: TrainState) -> None:
         """Traces the program; a thread compiles it."""
@@ -63,7 +64,7 @@ class DeviceDrawing:
             jax.block_until_ready(measured.total)
         return _TIMED * self._steps / (time.perf_counter() - began)
 
-    def _compiling(self, leg: Leg, steps: int, state: TrainState) -> Future:
+    def _compiling(self, leg: Leg, steps: int, state: TrainState) -> Future[jax.stages.Compiled]:
         known = leg.recipe, leg.sampling, leg.phase.batch, steps
         if known not in self._programs:
             lowered = step.train_on_drawn.lower(
@@ -90,7 +91,10 @@ class DeviceDrawing:
 
 
 def _run(
-    program: jax.stages.Compiled, on_device: tuple, places: list[jax.Array], state: TrainState
+    program: jax.stages.Compiled,
+    on_device: tuple[Any, ...],
+    places: list[jax.Array],
+    state: TrainState,
 ) -> tuple[TrainState, PairLoss]:
     return program(state, *on_device, *places)
 

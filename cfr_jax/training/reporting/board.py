@@ -53,7 +53,7 @@ class Board:
             # what an interrupted run wrote after its last checkpoint is hidden
             self._add(step + 1, session_log=SessionLog(status=SessionLog.START))
 
-    def training(self, line: dict, measured: list[PairLoss]) -> None:
+    def training(self, line: dict[str, Any], measured: list[PairLoss]) -> None:
         """The line of the journal, and how alpha and beta are spread over the pairs."""
         if self._events is None:
             return
@@ -68,7 +68,9 @@ class Board:
                         self._add(step, summary=drawn)
             self._events.flush()
 
-    def validation(self, step: int, found: dict, pictures: list[tuple[str, Scene]]) -> None:
+    def validation(
+        self, step: int, found: dict[str, Any], pictures: list[tuple[str, Scene]]
+    ) -> None:
         """Errors, and pairs as the network laid them."""
         if self._events is None:
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 _TRAINING = ("loss", "pose", "correspondence", "learning_rate", "steps_per_second", "skipped")
 _ITERATIONS = ("rotation_error", "translation_error", "beta", "alpha")
@@ -28,7 +29,7 @@ class Chart:
     curves: Sequence[Curve]
 
 
-def scalars(line: dict) -> dict[str, float]:
+def scalars(line: dict[str, Any]) -> dict[str, float]:
     """The numbers of a line of the journal by tag, as in "training/loss".
 
     What is known of every iteration has a number behind, from 1: "training/beta/1".
@@ -41,7 +42,7 @@ def scalars(line: dict) -> dict[str, float]:
     return found | _numbered("validation/rotation", validation.get("rotation_by_iteration", ()))
 
 
-def charts(lines: Sequence[dict]) -> list[Chart]:
+def charts(lines: Sequence[dict[str, Any]]) -> list[Chart]:
     """The charts of a whole journal; those of which nothing was measured are left out."""
     measured = [(line["step"], scalars(line)) for line in lines]
     tags = {tag for _, found in measured for tag in found}

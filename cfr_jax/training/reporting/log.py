@@ -72,13 +72,13 @@ class MetricsLog:
         lines = [line for line in read_journal(path) if step and line["step"] <= step]
         write_atomically(path, "".join(json.dumps(line) + "\n" for line in lines).encode())
 
-    def write(self, line: dict) -> None:
+    def write(self, line: dict[str, Any]) -> None:
         """Appends one line. Raises OSError, naming the file, where that cannot be written."""
         with writing(self.path), self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, allow_nan=False) + "\n")
 
 
-def read_journal(path: Path) -> list[dict]:
+def read_journal(path: Path) -> list[dict[str, Any]]:
     """The lines of a `metrics.jsonl`; one that a crash left unfinished is passed over."""
     lines = []
     for text in path.read_text("utf-8").splitlines() if path.exists() else ():
@@ -131,7 +131,7 @@ class Bar:
         """What went by since the last step is not counted: it says nothing of those to come."""
         self._bar.unpause()
 
-    def measured(self, line: dict) -> None:
+    def measured(self, line: dict[str, Any]) -> None:
         """Shows the newest means, if any: rotation error in degrees, translation error in radii."""
         if "loss" not in line:
             return

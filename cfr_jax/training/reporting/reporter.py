@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -30,8 +31,8 @@ class Reporter:
     and `resume`.
     """
 
-    def __init__(self, workdir: Path, task: Task, about: dict):
-        self.clock = Clock(**about["clock"])
+    def __init__(self, workdir: Path, task: Task, about: dict[str, Any]):
+        self.clock: Clock = Clock(**about["clock"])
         self._workdir, self._task, self._about = workdir, task, about
         self._waiting: list[PairLoss] = []
         self._steps = 0  # that were measured and not yet written
@@ -121,7 +122,7 @@ class Reporter:
         self._waiting, self._steps, self._written = [], 0, used["seconds"]
         self._bar.measured(line)
 
-    def validated(self, done: int, found: dict) -> None:
+    def validated(self, done: int, found: dict[str, Any]) -> None:
         """Writes a validation; `found["transforms"]` (b, L, 4, 4) is for the pictures."""
         shown = {name: value for name, value in found.items() if name != "transforms"}
         if self._journal is not None and self._board is not None:

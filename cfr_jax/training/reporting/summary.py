@@ -7,6 +7,7 @@ import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.training.reporting.charts import Chart, charts
@@ -23,7 +24,7 @@ pre { background: #fafbfc; border: 1px solid #e3e6ea; padding: .6rem; overflow-x
 """
 
 
-def write_summary(path: Path, lines: Sequence[dict], about: dict) -> None:
+def write_summary(path: Path, lines: Sequence[dict[str, Any]], about: dict[str, Any]) -> None:
     """The curves of a journal's `lines`, the best validation, the time used and the config of
     `about` (what a checkpoint says of itself)."""
     body = "".join(_figure(chart) for chart in charts(lines))
