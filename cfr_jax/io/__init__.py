@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from cfr_jax.io.coercion import as_point_cloud
     from cfr_jax.io.files import read, write
 else:
+    from cfr_jax.runtime.lazy import loader
+
     _HOMES = {
         "CloudFileError": "cloud",
         "PointCloud": "cloud",
@@ -20,11 +22,4 @@ else:
         "write": "files",
     }
 
-    def __getattr__(name):
-        if name not in _HOMES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        import importlib
-
-        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-        globals()[name] = value
-        return value
+    __getattr__ = loader(__name__, _HOMES)
