@@ -16,7 +16,7 @@ import numpy as np
 
 from cfr_jax import __version__
 from cfr_jax.training.config import TrainingConfig
-from cfr_jax.weights import files as weights
+from cfr_jax.weights.files import read_weights
 
 _NAMED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 WEIGHTS = "weights.safetensors"  # the best so far
@@ -83,7 +83,7 @@ def notes(config: TrainingConfig, best: dict[str, Any]) -> dict[str, str]:
 def holds(file: Path, best: dict[str, Any]) -> bool:
     """Whether this weights file is there, sound, and that of the validation `best`."""
     try:
-        return weights.read_weights(file).notes.get("validation") == json.dumps(best)
+        return read_weights(file).notes.get("validation") == json.dumps(best)
     except ValueError:
         return False
 

@@ -19,7 +19,7 @@ from cfr_jax.training.learner import remaining
 from cfr_jax.training.reporting.reporter import Reporter
 from cfr_jax.training.step import TrainState
 from cfr_jax.training.task import Task, fresh_params, prepare
-from cfr_jax.weights import files as weights
+from cfr_jax.weights.files import save_params
 
 _TRAINED = 0.97  # of the time left; the rest is for validations and checkpoints
 
@@ -171,7 +171,7 @@ class _Training:
         done beside it, once the checkpoint is there that calls them so."""
         file = self.workdir / identity.WEIGHTS
         if not identity.holds(file, best):
-            weights.save_params(file, state.average, identity.notes(self.config, best))
+            save_params(file, state.average, identity.notes(self.config, best))
 
     def _plan(self) -> None:
         """As many steps as fit into `train.minutes`, by the speed that they have here."""

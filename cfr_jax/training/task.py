@@ -25,7 +25,7 @@ from cfr_jax.networks.record import Params
 from cfr_jax.training import devices, optimizers
 from cfr_jax.training.config import Phase, TrainingConfig, checked
 from cfr_jax.training.learner import Learner, learner
-from cfr_jax.weights import files as weights
+from cfr_jax.weights.files import load_params
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ def fresh_params(config: TrainingConfig, chosen: Learner) -> Params:
     if not config.train.start_from:
         return jax.jit(chosen.fresh)(key)
     # the calibration is of the weights as they were
-    params = uncalibrated(weights.load_params(config.train.start_from, config.network))
+    params = uncalibrated(load_params(config.train.start_from, config.network))
     shapes = [jax.tree.map(jnp.shape, tree) for tree in (params, jax.eval_shape(chosen.fresh, key))]
     if shapes[0] != shapes[1]:
         raise ValueError(

@@ -28,7 +28,7 @@ from cfr_jax.training.reporting.board import Board
 from cfr_jax.training.reporting.reporter import Reporter
 from cfr_jax.training.stopping import Stopped
 from cfr_jax.training.task import fresh_params, prepare
-from cfr_jax.weights import files as weights
+from cfr_jax.weights.files import load_params, read_weights
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_an_interrupted_run_resumes_bit_for_bit(corpus_file, tmp_path, whole, ki
     assert int(first.step) == 16
     assert_same(first, second)
     files = (folder / "weights.safetensors" for folder in (whole[0], tmp_path))
-    assert_same(*(weights.load_params(file) for file in files))
+    assert_same(*(load_params(file) for file in files))
     for one, other in zip(lines_of(whole[0]), lines_of(tmp_path), strict=True):
         assert one["step"] == other["step"]
         assert one.get("loss") == other.get("loss")
@@ -122,7 +122,7 @@ def test_the_weights_are_those_that_the_newest_checkpoint_calls_best(
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(weights, "save_params", killed)
+        patch.setattr(loop, "save_params", killed)
         with pytest.raises(Killed):
             run(config(corpus_file), tmp_path)
     assert not (tmp_path / "weights.safetensors").exists()
@@ -133,7 +133,7 @@ def test_the_weights_are_those_that_the_newest_checkpoint_calls_best(
     best = run(given, tmp_path)  # nothing is left to do but this
 
     assert best["step"] == 4
-    made = weights.load_params(tmp_path / "weights.safetensors")
+    made = load_params(tmp_path / "weights.safetensors")
     assert_same(made, state_of(tmp_path).average)
 
 
@@ -167,7 +167,7 @@ def test_a_run_leaves_its_measurements_its_weights_and_a_page(whole):
     measured = {line["step"]: line["validation"] for line in lines if "validation" in line}
     assert list(measured) == [4, 8, 12, 16]
     assert best["rotation_mean"] == min(found["rotation_mean"] for found in measured.values())
-    made = weights.read_weights(folder / "weights.safetensors")
+    made = read_weights(folder / "weights.safetensors")
     assert json.loads(made.notes["validation"]) == best
     assert json.loads(made.notes["config"])["validate_every"] == 4
     page = (folder / "summary.html").read_text()
@@ -261,7 +261,7 @@ def test_weights_to_start_from_are_measured_first_and_kept_if_no_better_come(
 
     def worse_every_time(chosen, params, *others):
         same = np.array_equal(
-            params["features"]["kernel_1"], weights.load_params(begun)["features"]["kernel_1"]
+            params["features"]["kernel_1"], load_params(begun)["features"]["kernel_1"]
         )
         return found(chosen, params, *others) | {"rotation_mean": 1.0 + (not same)}
 
@@ -270,7 +270,7 @@ def test_weights_to_start_from_are_measured_first_and_kept_if_no_better_come(
 
     assert best["step"] == 0 and best["rotation_mean"] == 1.0
     assert [line["step"] for line in lines_of(tmp_path) if "validation" in line][0] == 0
-    assert_same(weights.load_params(tmp_path / "weights.safetensors"), weights.load_params(begun))
+    assert_same(load_params(tmp_path / "weights.safetensors"), load_params(begun))
 
 
 def test_gradients_that_stay_infinite_stop_the_run(corpus_file, tmp_path, monkeypatch):
@@ -354,7 +354,7 @@ def test_a_run_cut_short_before_its_first_validation_is_validated(
 
     best = run(given, tmp_path)
 
-    made = weights.read_weights(tmp_path / "weights.safetensors")
+    made = read_weights(tmp_path / "weights.safetensors")
     assert best["step"] == 4 and json.loads(made.notes["validation"]) == best
 
 
