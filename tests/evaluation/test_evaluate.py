@@ -121,13 +121,14 @@ def test_no_config_gives_a_baseline_an_option_that_it_does_not_take(path):
     import inspect
 
     from cfr_jax.evaluation.baselines import NAMES, baseline
+    from cfr_jax.evaluation.baselines.open3d_clouds import FeatureOptions
 
     for name, entry in read_config(path).methods.items():
         if entry.use not in NAMES:
             continue
         taken = inspect.signature(baseline(entry.use)).parameters
         if any(p.kind is p.VAR_KEYWORD for p in taken.values()):
-            taken = {**taken, **inspect.signature(baseline("fgr")).parameters}
+            taken = {**taken, **inspect.signature(FeatureOptions).parameters}
         options = set(entry.options)
         assert options <= set(taken), name
         needed = {k for k, p in taken.items() if p.default is p.empty} - {"source", "target"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from cfr_jax.data.scans import estimate_normals
@@ -33,11 +34,22 @@ def open3d_cloud(
     return thinned
 
 
-def described(
-    cloud: PointCloud, normal_radius: float, feature_radius: float, voxel: float | None
-) -> tuple[Any, Any]:
-    """A cloud and its fast point feature histograms (FPFH; Rusu et al., 2009)."""
-    o3d = require("open3d")
-    made = open3d_cloud(cloud, normal_radius, voxel)
-    around = o3d.geometry.KDTreeSearchParamHybrid(radius=feature_radius, max_nn=100)
-    return made, o3d.pipelines.registration.compute_fpfh_feature(made, around)
+@dataclass(frozen=True, kw_only=True)
+class FeatureOptions:
+    """What FGR and RANSAC take alike; lengths are in the unit of the clouds."""
+
+    distance: float
+    """Up to which a correspondence counts."""
+    normal_radius: float
+    feature_radius: float
+    """Of the neighborhoods that a feature describes."""
+    voxel: float | None = None
+    """The clouds are thinned to this first, if it is given."""
+    seed: int = 0
+
+    def described(self, cloud: PointCloud) -> tuple[Any, Any]:
+        """A cloud and its fast point feature histograms (FPFH; Rusu et al., 2009)."""
+        o3d = require("open3d")
+        made = open3d_cloud(cloud, self.normal_radius, self.voxel)
+        around = o3d.geometry.KDTreeSearchParamHybrid(radius=self.feature_radius, max_nn=100)
+        return made, o3d.pipelines.registration.compute_fpfh_feature(made, around)
