@@ -52,14 +52,8 @@ def among(chosen: tuple[int, int] | None, frames: Iterable[int | str]) -> bool:
     )
 
 
-class PairsOnDemand(Sequence[Pair]):
-    """`count` pairs, number i being `make(i)`, made whenever it is asked for."""
-
-    def __init__(self, count: int, make: Callable[[int], Pair]):
-        self._rows, self._make = range(count), make
-
-    def __len__(self) -> int:
-        return len(self._rows)
+class _OneByOne(Sequence[Pair]):
+    """Pairs that are read or made each time they are accessed."""
 
     @overload
     def __getitem__(self, index: int) -> Pair: ...
@@ -69,11 +63,29 @@ class PairsOnDemand(Sequence[Pair]):
 
     def __getitem__(self, index: int | slice) -> Pair | list[Pair]:
         if isinstance(index, slice):
-            return [self[row] for row in range(len(self))[index]]
-        return self._make(self._rows[index])
+            return [self._read(row) for row in range(len(self))[index]]
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index: got {index}, wanted one of {len(self)} pairs")
+        return self._read(range(len(self))[index])
+
+    def _read(self, index: int) -> Pair:
+        raise NotImplementedError
 
 
-class PairFile(Sequence[Pair]):
+class PairsOnDemand(_OneByOne):
+    """`count` pairs, number i being `make(i)`, made whenever it is asked for."""
+
+    def __init__(self, count: int, make: Callable[[int], Pair]):
+        self._count, self._make = count, make
+
+    def __len__(self) -> int:
+        return self._count
+
+    def _read(self, index: int) -> Pair:
+        return self._make(index)
+
+
+class PairFile(_OneByOne):
     """Pairs of a file in its order; `names` tells them apart without reading any cloud."""
 
     path: Path
@@ -86,22 +98,6 @@ class PairFile(Sequence[Pair]):
 
     def __len__(self) -> int:
         return len(self.names)
-
-    @overload
-    def __getitem__(self, index: int) -> Pair: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Pair]: ...
-
-    def __getitem__(self, index: int | slice) -> Pair | list[Pair]:
-        if isinstance(index, slice):
-            return [self[row] for row in range(len(self))[index]]
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"{self.path} holds {len(self)} pairs, asked for number {index}")
-        return self._read(range(len(self))[index])
-
-    def _read(self, index: int) -> Pair:
-        raise NotImplementedError
 
 
 class CsvPairs(PairFile):
