@@ -67,7 +67,7 @@ def _closest_by_differences(
     return lax.argmin(square, 1, jnp.int32)
 
 
-def squares(queries: Float[Array, "... 3"], points: Float[Array, "... 3"]) -> Float[Array, ...]:
+def squares(queries: Float[Array, "... 3"], points: Float[Array, "... 3"]) -> Float[Array, "..."]:
     """Squared distances, by differences: |a|^2 - 2ab + |b|^2 cancels to nothing for close points
     far from the origin."""
     x, y, z = ((queries[..., axis] - points[..., axis]) ** 2 for axis in range(3))
