@@ -113,7 +113,7 @@ def check_rigid(
 
 def _fault(transform: Float[np.ndarray, "4 4"]) -> str:
     if not np.isfinite(transform).all():
-        return "not all values are finite"
+        return "not all numbers are finite"
     turn = transform[:3, :3]
     off = np.abs(turn @ turn.T - np.eye(3)).max()
     if off > TOLERANCE:

@@ -46,7 +46,7 @@ class Frames:
         transforms = np.asarray(transforms, np.float64)
         # float32's error of 1e-7 would be visible at a million meters
         rotation = motions.nearest_rotation(transforms[..., :3, :3])
-        # rotated about the source's center, so that large coordinates never multiply float32's error
+        # rotate about the source's center, so that large coordinates never multiply float32's error
         shift = (
             self.target_center + self.scale * transforms[..., :3, 3] - rotation @ self.source_center
         )
@@ -153,7 +153,7 @@ def subsample(points: Float[np.ndarray, "n 3"], budget: int, seed: int) -> Int[n
     """Rows of at most `budget` points, evenly spread: a random one from each voxel of a grid.
 
     Bisection finds the coarsest grid that still fills at least `budget` voxels; surplus points are
-    dropped at random. If no grid fills that many, because points coincide, all rows are drawn at
+    dropped at random. If no grid fills that many, because points coincide, the rows are drawn at
     random. The same seed gives the same rows.
     """
     n = len(points)

@@ -100,7 +100,7 @@ def test_taking_categories_keeps_exactly_their_shapes_in_order(tmp_path):
     [
         ({"normal": None}, r"lacks \['normal'\]"),
         ({"data": np.zeros((3, 8, 2), np.float32)}, r"\(3, 8, 2\), wanted \(S, P, 3\)"),
-        ({"normal": np.zeros((3, 7, 3), np.float32)}, "`normal` is"),
+        ({"normal": np.zeros((3, 7, 3), np.float32)}, "`normal` has shape"),
         ({"label": np.zeros(2, np.uint8)}, "2 labels for 3"),
         ({"label": np.full(3, 5)}, "label 5 has no line"),
         ({"data": np.full((3, 8, 3), np.nan, np.float32)}, "not finite"),

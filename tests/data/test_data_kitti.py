@@ -171,5 +171,5 @@ def test_what_is_missing_or_broken_is_told(folder, tmp_path):
         kitti.read_frame(tmp_path, "00", 0)
     (tmp_path / "poses").mkdir()
     (tmp_path / "poses" / "00.txt").write_text("1 2 3\n")
-    with pytest.raises(ValueError, match="wanted 12 numbers a line"):
+    with pytest.raises(ValueError, match="wanted 12 numbers per line"):
         read_poses(tmp_path, "00")

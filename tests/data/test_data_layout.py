@@ -94,7 +94,7 @@ def test_a_readme_among_meshes_makes_no_folder_of_clouds(tmp_path):
 def test_the_kind_can_be_overruled_but_has_to_fit(tmp_path):
     make("clouds", tmp_path)
     assert recognize(tmp_path, "clouds").kind.name == "clouds"
-    with pytest.raises(ValueError, match="not laid out as kitti: it holds 2 .ply, 1 .pcd"):
+    with pytest.raises(ValueError, match="does not have the layout of kitti: it holds 2 .ply, 1"):
         recognize(tmp_path, "kitti")
     with pytest.raises(ValueError, match="layout: got 'photos', wanted one of pair-list"):
         recognize(tmp_path, "photos")

@@ -102,7 +102,7 @@ def test_scans_that_are_validated_on_must_not_be_trained_on(pairs_file, tmp_path
         return mixtures.open_mixture({"room": about}, tmp_path, "data.train")
 
     mixtures.check_apart(opened((0, 6)), opened((6, 12)))
-    with pytest.raises(ValueError, match="2 of its 6 scans are in data.train, too"):
+    with pytest.raises(ValueError, match="2 of its 6 scans are also in data.train"):
         mixtures.check_apart(opened((0, 8)), opened((6, 12)))
 
 
@@ -239,7 +239,7 @@ def test_a_pair_that_cannot_be_drawn_is_named():
     pair = Pair("heap.ply", heap, heap, transform=np.eye(4))
     source = scenes.SceneSource(("a/heap.ply",), (("a", "a"),), lambda _: pair, "stamp")
 
-    with pytest.raises(ValueError, match="^a/heap.ply: .*all are alike"):
+    with pytest.raises(ValueError, match="^a/heap.ply: .*do not coincide"):
         source.draw(0, WHOLE, np.random.default_rng(0))
 
 
@@ -284,11 +284,11 @@ def test_lists_share_a_scan_where_they_name_one_file(tmp_path, surface, motion):
         about = {"kind": "pair-list", "path": str(tmp_path / name)}
         return mixtures.open_mixture({"a": about}, tmp_path, "data.train")
 
-    with pytest.raises(ValueError, match="1 of its 2 scans are in data.train, too"):
+    with pytest.raises(ValueError, match="1 of its 2 scans are also in data.train"):
         mixtures.check_apart(opened("train.csv"), opened("val.csv"))
     about = {"kind": "clouds", "path": str(tmp_path)}
     folder = mixtures.open_mixture({"a": about}, tmp_path, "data.validation")
-    with pytest.raises(ValueError, match="2 of its 3 scans are in data.train, too"):
+    with pytest.raises(ValueError, match="2 of its 3 scans are also in data.train"):
         mixtures.check_apart(opened("train.csv"), folder)
 
 
@@ -323,8 +323,8 @@ def test_validation_pairs_are_the_same_every_time(pairs_file, tmp_path):
         ({"kind": "video", "path": "a"}, "kind: got 'video'"),
         ({"kind": "clouds", "path": "nowhere"}, "no folder of scans at nowhere"),
         ({"kind": "clouds", "path": "a", "frames": (0, 1)}, "clouds got .*frames.*wanted path"),
-        ({"kind": "pair-list"}, "data.train.mine.path: none given"),
-        ({"kind": "clouds", "path": ""}, "data.train.mine.path: none given"),
+        ({"kind": "pair-list"}, "data.train.mine.path: got none, wanted a file or a folder"),
+        ({"kind": "clouds", "path": ""}, "data.train.mine.path: got none"),
         ({"kind": "pair-list", "path": "a", "repeat": -1}, "repeat: got -1"),
         ({"kind": "pair-list", "path": "a", "repeat": 0}, "no source"),
     ],

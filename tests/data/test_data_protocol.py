@@ -198,11 +198,11 @@ def test_too_few_points_are_all_used_before_any_is_repeated():
 
 
 def test_impossible_requests_are_refused_by_name():
-    with pytest.raises(ValueError, match="keep is 1.5"):
+    with pytest.raises(ValueError, match="keep: got 1.5"):
         Protocol("x", keep=1.5)
-    with pytest.raises(ValueError, match="points is 0"):
+    with pytest.raises(ValueError, match="points: got 0"):
         Protocol("x", points=0)
-    with pytest.raises(ValueError, match="index is 9"):
+    with pytest.raises(ValueError, match="index: got 9, wanted 0 to"):
         fixed_pair(corpus_of(), 9, protocols.clean)
     with pytest.raises(ValueError, match="leaves none of 8 points"):
         protocols.crop(np.zeros((8, 3), np.float32), 0.7, np.random.default_rng(0))

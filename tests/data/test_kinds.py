@@ -138,7 +138,7 @@ def test_train_py_takes_a_kind_from_outside_by_its_config(survey, tmp_path):
     config = training_config(survey)
     about = {"kind": "survey", "path": str(survey)}
     config.data.train, config.data.validation = {"here": about}, {"here": about | {"step": 3}}
-    with pytest.raises(ValueError, match="2 of its 2 scans are in data.train, too"):
+    with pytest.raises(ValueError, match="2 of its 2 scans are also in data.train"):
         prepare(config, tmp_path)
 
 

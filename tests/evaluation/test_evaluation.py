@@ -259,7 +259,7 @@ def test_pairs_of_a_corpus_are_those_of_its_fixed_protocol(tmp_path, kind):
         ({"kind": "movies"}, 1, "data.kind: got 'movies', wanted one of pair-list, pair-file"),
         ({"protocol": "hard"}, 1, "protocol: got 'hard', wanted one of clean, noise, partial"),
         ({"path": "nowhere.h5"}, 1, "no corpus at nowhere.h5"),
-        ({"kind": "modelnet40", "path": "nowhere", "split": "test"}, 1, "Get modelnet40_ply"),
+        ({"kind": "modelnet40", "path": "nowhere", "split": "test"}, 1, "Download modelnet40_ply"),
         ({}, -1, "limit is -1"),
     ],
 )

@@ -92,7 +92,7 @@ def broken(**changes):
 
 BROKEN = {
     "not all numbers are finite": broken(at={(0, 3): np.nan}),
-    "off the identity": np.diag([1.0, 1.0, 1.01, 1.0]),
+    "differs from the identity": np.diag([1.0, 1.0, 1.01, 1.0]),
     "R is a reflection": np.diag([1.0, 1.0, -1.0, 1.0]),
     "last row is": broken(at={(3, 3): 2.0}),
 }
