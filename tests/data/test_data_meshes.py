@@ -4,7 +4,7 @@ import mesh_samples as samples
 import numpy as np
 import pytest
 
-from cfr_jax.data.making.furniture import CATALOGUE, FurnitureLibrary
+from cfr_jax.data.making.furniture import CATALOG, FurnitureLibrary
 from cfr_jax.data.making.mesh_formats import mesh_formats
 from cfr_jax.data.making.meshes import parse_ac3d, parse_pmd, read_mesh
 from cfr_jax.io.formats import by_suffix
@@ -158,7 +158,7 @@ def test_what_is_no_mesh_is_refused(tmp_path):
     cloud.write_text(
         header + "".join(f"property float {a}\n" for a in "xyz") + "end_header\n0 0 0\n"
     )
-    with pytest.raises(ValueError, match="is a point cloud, wanted a mesh"):
+    with pytest.raises(ValueError, match="got a point cloud, wanted a mesh"):
         read_mesh(cloud)
     with pytest.raises(ValueError, match="unknown suffix '.jpg'"):
         read_mesh(tmp_path / "cloud.jpg")
@@ -172,7 +172,7 @@ def test_a_furniture_library_gives_pieces_at_their_true_size(tmp_path):
     with FurnitureLibrary(path) as library:
         chair, bed = library.pieces
         assert (chair.identifier, chair.name, chair.category) == ("Lib#chair", "Ch\xe4ir", "Seats")
-        assert bed.size == (2.0, 1.0, 0.505)  # width, height, depth: centimeters in the catalogue
+        assert bed.size == (2.0, 1.0, 0.505)  # width, height, depth: centimeters in the catalog
         mesh = library.mesh(chair)
     np.testing.assert_array_equal(mesh.triangles, KNOT.triangles)
     scaled = chair.scaled(mesh)
@@ -187,7 +187,7 @@ def test_a_model_may_be_a_zip_in_the_zip(tmp_path):
         archive.writestr("deep/model.obj", samples.obj(KNOT))
     entry = "name#7=A\nmodel#7=/m.zip\nwidth#7=1\ndepth#7=1\nheight#7=1\nid#7=x\\u00e9\\:y\n"
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(CATALOGUE, entry)
+        archive.writestr(CATALOG, entry)
         archive.write(inner, "m.zip")
     with FurnitureLibrary(path) as library:
         (piece,) = library.pieces
@@ -196,18 +196,18 @@ def test_a_model_may_be_a_zip_in_the_zip(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "catalogue, message",
+    "catalog, message",
     [
         (None, "not a furniture library"),
         ("name#1=A\nmodel#1=/m.obj\n", "lacks \\['width', 'depth', 'height'\\]"),
         ("name#1=A\nmodel#1=/m\nwidth#1=wide\ndepth#1=1\nheight#1=1\n", "no number"),
     ],
 )
-def test_a_damaged_library_is_refused(tmp_path, catalogue, message):
+def test_a_damaged_library_is_refused(tmp_path, catalog, message):
     path = tmp_path / "library.sh3f"
     with zipfile.ZipFile(path, "w") as archive:
-        if catalogue is not None:
-            archive.writestr(CATALOGUE, catalogue)
+        if catalog is not None:
+            archive.writestr(CATALOG, catalog)
     with pytest.raises(ValueError, match=message):
         FurnitureLibrary(path)
 
@@ -215,6 +215,6 @@ def test_a_damaged_library_is_refused(tmp_path, catalogue, message):
 def test_a_missing_model_is_told_when_it_is_asked_for(tmp_path):
     path = tmp_path / "library.sh3f"
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(CATALOGUE, "name#1=A\nmodel#1=m.obj\nwidth#1=1\ndepth#1=1\nheight#1=1\n")
+        archive.writestr(CATALOG, "name#1=A\nmodel#1=m.obj\nwidth#1=1\ndepth#1=1\nheight#1=1\n")
     with FurnitureLibrary(path) as library, pytest.raises(ValueError, match="cannot read m.obj"):
         library.mesh(library.pieces[0])

@@ -321,7 +321,7 @@ def test_validation_pairs_are_the_same_every_time(pairs_file, tmp_path):
     ("about", "wanted"),
     [
         ({"kind": "video", "path": "a"}, "kind: got 'video'"),
-        ({"kind": "clouds", "path": "nowhere"}, "no folder of scans at nowhere"),
+        ({"kind": "clouds", "path": "nowhere"}, "path: there is no folder of scans at nowhere"),
         ({"kind": "clouds", "path": "a", "frames": (0, 1)}, "clouds got .*frames.*wanted path"),
         ({"kind": "pair-list"}, "data.train.mine.path: got none, wanted a file or a folder"),
         ({"kind": "clouds", "path": ""}, "data.train.mine.path: got none"),

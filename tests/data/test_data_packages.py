@@ -42,8 +42,8 @@ def test_a_package_cannot_write_outside_of_the_folder(tmp_path):
     [
         (lambda data: b"PK" + data[2:], "not a Debian package"),
         (lambda data: data[:100], "holds no data.tar, or is cut off"),
-        (lambda data: data[:-60], "is cut off: data.tar.xz wants"),
-        (lambda data: data[:-120] + b"\1" * 120, "not a whole Debian package"),
+        (lambda data: data[:-60], "is cut off: data.tar.xz should have"),
+        (lambda data: data[:-120] + b"\1" * 120, "not a complete Debian package"),
         (lambda data: data.replace(b"data.tar.xz ", b"data.tar.zst"), "packed in a way"),
     ],
 )
