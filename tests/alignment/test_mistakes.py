@@ -39,7 +39,7 @@ MISTAKES = {
     "a negative seed": ("register a.ply b.ply --seed -1", "wanted an integer of at least 0"),
     "no points at all": ("register a.ply b.ply --max-points 0", "integer of at least 1"),
     "unknown weights": ("register a.ply b.ply --weights best", "shipped are object"),
-    "other files as weights": ("register a.ply b.ply --weights a.ply", "no readable safetensors"),
+    "other files as weights": ("register a.ply b.ply --weights a.ply", "a readable safetensors"),
     "no start": ("register a.ply b.ply --initial none.txt", "none.txt: cannot be read"),
     "a start of words": ("register a.ply b.ply --initial words.xyz", "wanted a 4x4 transform"),
     "a start that scales": ("register a.ply b.ply --initial scaled.npy", "a proper rotation"),

@@ -26,7 +26,7 @@ def test_pmd_gives_the_triangles_whatever_the_texture_coordinates(sets):
     np.testing.assert_array_equal(mesh.triangles, KNOT.triangles)
 
 
-def test_pmd_faces_turn_to_agree_with_the_normals_of_their_vertices():
+def test_pmd_faces_are_wound_to_agree_with_the_normals_of_their_vertices():
     flipped = type(KNOT)(KNOT.vertices, KNOT.triangles[:, ::-1].copy(), "flipped")
     assert volume(flipped) < 0 < volume(KNOT)
     mesh = parse_pmd(samples.pmd(flipped, OUTWARD), "flipped")
@@ -36,7 +36,7 @@ def test_pmd_faces_turn_to_agree_with_the_normals_of_their_vertices():
 @pytest.mark.parametrize(
     "damage, message",
     [
-        (lambda data: data[:10], "no PMD file"),
+        (lambda data: data[:10], "got 10 bytes, wanted a PMD file"),
         (lambda data: b"PSMB" + data[4:], "b'PSMB'"),
         (lambda data: data[:4] + b"\3" + data[5:], "version 3"),
         (lambda data: data[:500], "ends within its 30 vertices"),
@@ -112,7 +112,7 @@ def test_ac3d_places_objects_by_the_tree_and_leaves_lines_out(end):
     assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2], [4, 5, 6]]
 
 
-def test_ac3d_may_promise_more_children_than_come():
+def test_ac3d_may_declare_more_children_than_it_has():
     text = samples.ac3d(KNOT).replace("kids 1", "kids 3", 1)
     mesh = parse_ac3d(text.encode(), "knot")
     np.testing.assert_array_equal(mesh.vertices, KNOT.vertices)
@@ -152,7 +152,7 @@ def test_every_kind_of_file_gives_the_same_mesh(tmp_path):
         np.testing.assert_array_equal(mesh.triangles, KNOT.triangles)
 
 
-def test_what_is_no_mesh_is_refused(tmp_path):
+def test_a_file_that_is_not_a_mesh_is_refused(tmp_path):
     cloud = tmp_path / "cloud.ply"
     header = "ply\nformat ascii 1.0\nelement vertex 1\n"
     cloud.write_text(
@@ -200,7 +200,7 @@ def test_a_model_may_be_a_zip_in_the_zip(tmp_path):
     [
         (None, "not a furniture library"),
         ("name#1=A\nmodel#1=/m.obj\n", "lacks \\['width', 'depth', 'height'\\]"),
-        ("name#1=A\nmodel#1=/m\nwidth#1=wide\ndepth#1=1\nheight#1=1\n", "no number"),
+        ("name#1=A\nmodel#1=/m\nwidth#1=wide\ndepth#1=1\nheight#1=1\n", "not a number"),
     ],
 )
 def test_a_damaged_library_is_refused(tmp_path, catalog, message):
@@ -212,7 +212,7 @@ def test_a_damaged_library_is_refused(tmp_path, catalog, message):
         FurnitureLibrary(path)
 
 
-def test_a_missing_model_is_told_when_it_is_asked_for(tmp_path):
+def test_a_missing_model_is_reported_when_it_is_read(tmp_path):
     path = tmp_path / "library.sh3f"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(CATALOG, "name#1=A\nmodel#1=m.obj\nwidth#1=1\ndepth#1=1\nheight#1=1\n")

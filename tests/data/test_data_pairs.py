@@ -13,7 +13,7 @@ WRITTEN = ",".join(map(str, TRUTH.ravel()))
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two clouds as text in a folder of their own."""
+    """A folder with two clouds as text files."""
     rng = np.random.default_rng(0)
     (tmp_path / "clouds").mkdir()
     for name in ("a", "b"):
@@ -132,14 +132,14 @@ def test_a_bad_group_is_named(tmp_path, held, message):
         Hdf5Pairs(tmp_path / "pairs.h5")[0]
 
 
-def test_what_is_no_list_of_pairs_is_refused(tmp_path):
+def test_a_file_that_is_not_a_list_of_pairs_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no file of pairs at"):
         CsvPairs(tmp_path / "absent.csv")
     (tmp_path / "empty.csv").write_text("source,target\n")
     with pytest.raises(ValueError, match="lists no pairs"):
         CsvPairs(tmp_path / "empty.csv")
     (tmp_path / "noise.csv").write_bytes(bytes(range(255, 0, -1)))
-    with pytest.raises(ValueError, match="no list in CSV"):
+    with pytest.raises(ValueError, match="is not a CSV list"):
         CsvPairs(tmp_path / "noise.csv")
     with h5py.File(tmp_path / "flat.h5", "w") as file:
         file["data"] = np.ones(3)
