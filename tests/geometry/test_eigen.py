@@ -65,7 +65,7 @@ def random_symmetric(size, count=500):
 
 
 @pytest.mark.parametrize("size", [3, 4])
-def test_only_the_last_sweep_leaves_a_float32_result_unchanged(size):
+def test_the_last_sweep_changes_no_float32_result_and_the_first_ones_do(size):
     matrices = random_symmetric(size)
 
     values, earlier, early = (

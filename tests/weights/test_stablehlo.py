@@ -146,9 +146,7 @@ def test_the_command_writes_a_program_and_says_what_it_takes(tiny, tmp_path, cap
         (["--out", "model.onnx"], "wanted a name that ends in .stablehlo"),
     ],
 )
-def test_the_command_refuses_what_it_cannot_export(
-    options, told, tmp_path, monkeypatch, capsys
-):
+def test_the_command_refuses_what_it_cannot_export(options, told, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["export", "--out", "model.stablehlo", *options]) == 2
     assert told in capsys.readouterr().err and list(tmp_path.iterdir()) == []
