@@ -29,7 +29,7 @@ def read_card(name: str) -> dict[str, Any]:
     """
     if name not in names():
         raise ValueError(
-            f"name: there are no shipped weights {name!r}, wanted one of {', '.join(names())}"
+            f"there are no shipped weights called {name!r}; shipped are {', '.join(names())}"
         )
     path = FOLDER / f"{name}.json"
     try:
