@@ -164,7 +164,7 @@ def test_a_damaged_file_is_refused(tmp_path, suffix):
     path = tmp_path / f"authors{suffix}"
     path.write_bytes(b"PK\x03\x04 nothing of the kind" * 9)
 
-    with pytest.raises(ValueError, match="no readable checkpoint"):
+    with pytest.raises(ValueError, match="is not a readable checkpoint"):
         convert(path)
 
 
@@ -172,5 +172,5 @@ def test_objects_in_a_file_are_never_unpickled(tmp_path):
     path = tmp_path / "authors.npz"
     np.savez(path, **{"weights_net.prepool.0.weight": np.array([{"an": "object"}], object)})
 
-    with pytest.raises(ValueError, match="no readable checkpoint"):
+    with pytest.raises(ValueError, match="is not a readable checkpoint"):
         convert(path)
