@@ -64,7 +64,7 @@ GOOD = {"register": {"bias": 1.0}, "align": {"bias": 2.0}}
 @pytest.mark.parametrize(
     ("note", "told"),
     [
-        ("{", "the note is no JSON"),
+        ("{", "the note is not valid JSON"),
         ("[]", "got list, wanted register and align"),
         ('{"register": {"bias": 1}}', r"got \['register'\], wanted register and align"),
         (json.dumps(GOOD | {"align": {"fitness": 1.0}}), "align has no bias"),
