@@ -106,7 +106,7 @@ def test_a_method_that_crashes_hangs_or_raises_fails_on_that_pair_alone(tmp_path
     assert "SIGSEGV" in reasons[1]
     assert "no answer within 1 s" in reasons[2]
     assert reasons[3] == "RuntimeError: no luck"
-    assert reasons[4] == "answered no rigid motion"
+    assert reasons[4] == "returned a motion that is not rigid"
 
 
 def test_a_method_whose_library_is_missing_is_left_out_with_the_way_out(tmp_path):
@@ -152,7 +152,7 @@ def test_stored_answers_keep_every_digit(tmp_path):
 def test_a_damaged_file_of_answers_is_refused(tmp_path, content):
     path = tmp_path / "part.json"
     path.write_text(content)
-    with pytest.raises(ValueError, match="no file of results .*remove it"):
+    with pytest.raises(ValueError, match="not a file of results .*remove it"):
         store.load(path, dict(ABOUT), [])
 
 

@@ -81,7 +81,8 @@ def test_a_damaged_note_is_refused(note, told):
 
 def test_coefficients_of_other_clues_are_refused():
     FITTED.check("register", ["settled"])
-    with pytest.raises(ValueError, match=r"align has other clues than .*\(fitness, speed\).*anew"):
+    wanted = r"align has other clues than .*\(fitness, speed\).*fit it again"
+    with pytest.raises(ValueError, match=wanted):
         FITTED.check("align", ["speed"])
 
 

@@ -61,7 +61,10 @@ def test_the_calibration_comes_back_with_the_weights(fresh, tmp_path):
     ("fitted", "told"),
     [
         ("nonsense", "the note is not valid JSON"),
-        ('{"register": {"bias": 1}, "align": {"bias": 1}}', "register has other clues than this version"),
+        (
+            '{"register": {"bias": 1}, "align": {"bias": 1}}',
+            "register has other clues than this version",
+        ),
     ],
 )
 def test_a_damaged_calibration_is_refused(fresh, tmp_path, monkeypatch, fitted, told):

@@ -26,7 +26,7 @@ def register(
 ) -> Float[np.ndarray, "4 4"]:
     """FGR with correspondences from FPFH over `feature_radius`, robust beyond `distance`.
 
-    The clouds are thinned to `voxel` first, if it is given; `seed` chooses the tuples tested.
+    If `voxel` is given, the clouds are thinned to it first. `seed` chooses the tuples to test.
     """
     o3d = require("open3d")
     methods = o3d.pipelines.registration
@@ -39,7 +39,7 @@ def register(
         source_features,
         target_features,
         methods.FastGlobalRegistrationOption(
-            # the distance is in the clouds' unit, not a share of their extent
+            # the distance is in the unit of the clouds, not a share of their extent
             use_absolute_scale=True,
             decrease_mu=True,
             maximum_correspondence_distance=distance,

@@ -1,4 +1,4 @@
-"""RANSAC (Fischler & Bolles, 1981) over correspondences of FPFH, by Open3D."""
+"""RANSAC (Fischler & Bolles, 1981) on FPFH correspondences, by Open3D."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from cfr_jax.evaluation.baselines.open3d_clouds import described
 from cfr_jax.io import PointCloud
 from cfr_jax.runtime.optional import require
 
-_EDGES = 0.9  # lengths between the samples of a hypothesis agree to this share
+_EDGES = 0.9  # least ratio of the lengths between the samples of a hypothesis
 
 
 def register(
@@ -25,8 +25,8 @@ def register(
 ) -> Float[np.ndarray, "4 4"]:
     """The best of `iterations` hypotheses of three correspondences, inliers within `distance`.
 
-    The clouds are thinned to `voxel` first, if it is given. The same `seed` gives the same answer
-    only on one thread: with more, threads race for the random numbers.
+    If `voxel` is given, the clouds are thinned to it first. The same `seed` gives the same answer
+    only on one thread: several threads race for the random numbers.
     """
     o3d = require("open3d")
     methods = o3d.pipelines.registration

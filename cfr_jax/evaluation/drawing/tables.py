@@ -1,4 +1,4 @@
-"""The table in Markdown. What depends on the machine and the day stands apart from the errors."""
+"""The table in Markdown. What depends on machine and day is in a section apart from the errors."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def write_table(
     apart: Sequence[Measured] = (),
     numbers_apart: Mapping[str, Numbers] | None = None,
 ) -> str:
-    """All of it: errors, their intervals, times, failures, settings.
+    """The whole text: errors, their intervals, times, failures, settings.
 
-    `about` is what `running` knows of data and machine; `missing` tells why a method was left out;
-    `apart` and `numbers_apart` are the same without the pairs of nearly symmetric shapes. Same
-    answers, same text, but for the section `Time`.
+    `about` describes the data and the machine; `missing` says why a method was left out. `apart`
+    and `numbers_apart` are like `measured` and `numbers`, without the pairs of nearly symmetric
+    shapes. The same answers give the same text, except for the section `Time`.
     """
     unit = about["unit"]
     lengths = unit or "the unit of the clouds"
@@ -74,7 +74,7 @@ def _errors(
     numbers: Mapping[str, Numbers],
     columns: Sequence[Summary],
 ) -> list[str]:
-    """A row for each method, and once more with the intervals."""
+    """A table with a row for each method, and a second one with the intervals."""
     header = ["method", *(str(column.title) for column in columns)]
     values, intervals = (
         [
@@ -114,7 +114,7 @@ def _apart(
 
 
 def _modules(measured: Sequence[Measured]) -> list[str]:
-    """Milliseconds of the parts of a network, where they were timed."""
+    """A table of the milliseconds of each part of a network, if any were timed."""
     timed = {m.name: m.modules for m in measured if m.modules}
     if not timed:
         return []
@@ -139,7 +139,7 @@ def _modules(measured: Sequence[Measured]) -> list[str]:
 def _columns(
     measured: Sequence[Measured], thresholds: Sequence[Sequence[float]], unit: str
 ) -> list[Summary]:
-    """Of every metric that some method was measured by, and the recalls."""
+    """The columns: summaries of every metric that was measured, and the recalls."""
     known = [metric for metric in metrics.table() if any(metric.name in m.errors for m in measured)]
     summaries = [summary for metric in known for summary in metric.summaries if summary.title]
     return summaries + [metrics.recall(angle, distance, unit) for angle, distance in thresholds]
