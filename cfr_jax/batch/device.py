@@ -109,8 +109,7 @@ def solve_many(
     *,
     refine: Refinement | None,
 ) -> Found:
-    """`solving.solve` for pairs of one size, all at once; the first axis of each leaf is the pair.
-    """
+    """`solving.solve` for pairs of one size, all at once; each leaf has the pairs as first axis."""
 
     def solve(source: solving.DeviceCloud, target: Encoded) -> Found:
         return solving.solve(params, source.prepared(), target, refine=refine)

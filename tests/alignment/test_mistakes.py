@@ -84,7 +84,7 @@ MISTAKES = {
     "no cluster": ("batch good.csv --out r.csv --shard auto", "give --shard I/N instead"),
     "no workers": ("batch good.csv --out r.csv --workers 0", "an integer of at least 1"),
     "a file of theirs": ("batch good.csv --out theirs.csv", "choose another --out"),
-    "other settings": ("batch good.csv --out begun.csv", "give the same options to go on"),
+    "other settings": ("batch good.csv --out begun.csv", "give the same options to continue"),
     "all files bad": ("batch bad.csv --out r.csv", "add --retry-failed"),
     # data
     "no corpus": ("data info none.h5", "A corpus is an HDF5 file"),

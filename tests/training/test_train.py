@@ -73,4 +73,4 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(tmp_path):
             break
     process.kill()
     process.communicate()
-    assert line == f"going on from step {saved}\n"
+    assert line == f"resuming at step {saved}\n"

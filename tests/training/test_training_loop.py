@@ -194,7 +194,7 @@ def test_another_config_goes_on_with_a_word(killed_config, tmp_path, capsys):
     run(changed, tmp_path)
 
     told = capsys.readouterr().out
-    assert "going on from step 4" in told and "keep_checkpoints 2 → 3" in told
+    assert "resuming at step 4" in told and "keep_checkpoints 2 → 3" in told
     assert int(state_of(tmp_path).step) == 16
 
 
@@ -207,7 +207,7 @@ def test_a_run_from_before_phases_had_samplings_goes_on_without_a_word(corpus_fi
 
     told = identity.go_on(before, now, 16, tmp_path)
 
-    assert told == ["going on from step 4"] and now["step"] == 4
+    assert told == ["resuming at step 4"] and now["step"] == 4
 
 
 def test_a_workdir_of_other_training_data_is_refused(tmp_path, whole):
@@ -412,7 +412,7 @@ def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monk
     monkeypatch.setattr(Board, "close", closed_in_vain)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Checkpoints, "_finish", full_after_step_8)
-        with pytest.raises(SaveError, match="step 12 .*\n?.*last good one is of step 8") as stopped:
+        with pytest.raises(SaveError, match="step 12 .*\n?.*last good one is at step 8") as stopped:
             run(given, tmp_path)
     assert "No space left" in str(stopped.value) and "same command" in str(stopped.value)
     monkeypatch.undo()

@@ -244,7 +244,7 @@ def test_bfloat16_is_of_cfr_alone(corpus_file, tmp_path):
     given = config(corpus_file, precision="bfloat16")
     given.network = "rpmnet"
 
-    with pytest.raises(ValueError, match="precision: got 'bfloat16', which rpmnet does not have"):
+    with pytest.raises(ValueError, match="precision: got 'bfloat16', which rpmnet does not support"):
         run(given, tmp_path)
 
 

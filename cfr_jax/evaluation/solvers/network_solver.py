@@ -145,8 +145,7 @@ def _prepare_each(
 def _register_batches(
     params: dict, program: Program, estimated: bool, size: int, pairs: Sequence[Pair]
 ) -> list[Answer]:
-    """Puts clouds of different sizes into different batches; a short batch repeats its last pair.
-    """
+    """Batches hold clouds of the same size; a short batch repeats its last pair."""
     rows = defaultdict(list)
     for row, pair in enumerate(pairs):
         rows[len(pair.source), len(pair.target)].append(row)
