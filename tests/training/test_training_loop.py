@@ -380,7 +380,7 @@ def test_weights_to_start_from_have_the_iterations_that_are_asked_for(corpus_fil
     given = config(corpus_file)
     given.train.start_from, given.iterations = str(whole[0] / "weights.safetensors"), 2
 
-    with pytest.raises(ValueError, match="start_from: .*other iterations than .*iterations = 2"):
+    with pytest.raises(ValueError, match="start_from: .*was not made with .*iterations = 2"):
         fresh_params(given, learner.learner(given))
 
 
