@@ -138,7 +138,7 @@ class _Training:
                 self.checkpoints.wait()
                 raise stopping.Stopped(
                     f"stopped at step {done} of {task.steps}, all saved; "
-                    "the same command goes on from there",
+                    "run the same command again to resume",
                     asked,
                 )
 

@@ -49,7 +49,7 @@ MISTAKES = {
     "output is a folder": ("register a.ply b.ply --json scans", "is a folder, wanted a file"),
     "output is a device": ("register a.ply b.ply --json /dev/full", "wanted a file to write"),
     "a read-only place": ("register a.ply b.ply --out /proc/c.ply", "cannot be written to"),
-    "output over input": ("register a.ply b.ply --out a.ply", "a.ply would be written over"),
+    "output over input": ("register a.ply b.ply --out a.ply", "a.ply would be overwritten"),
     # extras that are missing
     "pictures without matplotlib": ("register a.ply b.ply --png p.png", 'install "cfr_jax[viz]"'),
     "completion without shtab": ("completion bash", 'pip install "cfr_jax[completion]"'),
@@ -78,7 +78,7 @@ MISTAKES = {
     "no such target": ("batch scans --out r.csv --target none.ply", "there is no file none.ply"),
     "a target too many": ("batch good.csv --out r.csv --target a.ply", "already names its targets"),
     "a table of no format": ("batch good.csv --out r.xlsx", "wanted a name that ends in .csv"),
-    "the list as the table": ("batch good.csv --out good.csv", "would be written over"),
+    "the list as the table": ("batch good.csv --out good.csv", "would be overwritten"),
     "a folder as the table": ("batch good.csv --out dir.csv", "is a folder, wanted a file"),
     "shard five of four": ("batch good.csv --out r.csv --shard 5/4", "wanted I/N with I from 1"),
     "no cluster": ("batch good.csv --out r.csv --shard auto", "give --shard I/N instead"),
@@ -92,7 +92,7 @@ MISTAKES = {
     "a sheet of clouds": ("data info scans --sheet s.png", "wanted a corpus of shapes"),
     "a sheet of no format": ("data info shapes.h5 --sheet s.jpg", "that ends in .png"),
     "no meshes": ("data build photos --out c.h5", "wanted files that end in .ply .off"),
-    "too few points": ("data build photos --out c.h5 --points 2", "wanted 16 at least"),
+    "too few points": ("data build photos --out c.h5 --points 2", "wanted at least 16"),
     "no packages": ("data open-cad --out c --debs none", "--debs: there is no folder none"),
 }  # fmt: skip
 
