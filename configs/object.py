@@ -13,7 +13,7 @@ def get_config() -> TrainingConfig:
     estimated = {"estimated_normals": 0.6}
     return TrainingConfig(
         # In every phase, neighborhoods cover the same part of the shape as in the test. (For the
-        # reason see "Neighborhoods" in docs/training.md.)
+        # reason see "Neighborhoods" in docs/notes/training.md.)
         phases=(
             Phase(steps=6000, points=256, neighbors=24, batch=8),
             Phase(steps=4750, points=358, neighbors=32, batch=8),

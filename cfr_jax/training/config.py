@@ -141,7 +141,7 @@ class TrainingConfig:
     `networks.inputs.Settings`."""
     data: DataSection = field(default_factory=DataSection)
     # Clouds grow during training: at first, small clouds teach the most per second, and the shapes
-    # of the weights depend neither on points nor on neighbors (docs/training.md).
+    # of the weights depend neither on points nor on neighbors (docs/notes/training.md).
     phases: tuple[Phase, ...] = field(
         default_factory=lambda: (
             Phase(steps=3000, points=256, neighbors=24, batch=8),

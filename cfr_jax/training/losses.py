@@ -15,8 +15,8 @@ from cfr_jax.networks.record import Step
 
 _DISCOUNT = 0.5  # the last iteration counts fully, each earlier one half as much as the next
 _INLIER_WEIGHT = 0.01
-# Soft targets of the correspondence term, in radii of the unit sphere. With this term, training was
-# measured to learn faster than with the pose alone (docs/training.md).
+# Soft targets of the correspondence term (docs/training.md), in radii of the unit sphere. With this
+# term, training was measured to learn faster than with the pose alone.
 _SPREAD = 0.035
 _REACH = 0.1
 

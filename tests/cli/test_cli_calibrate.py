@@ -91,7 +91,7 @@ def test_a_check_measures_and_writes_a_figure_alone(data, answers, tmp_path, cap
     [
         (["--check"], "has no calibration to check; give --out"),
         (["--out", "new.npz"], "--out: got new.npz, wanted a name that ends in .safetensors"),
-        (["--out", "bare.safetensors"], "bare.safetensors would be written over"),
+        (["--out", "bare.safetensors"], "bare.safetensors would be overwritten"),
         ([], "one of the arguments --out --check is required"),
         (["--out", "new.safetensors", "--check"], "not allowed with argument --out"),
         (["--out", "new.safetensors", "--pairs", "0"], "--pairs: got '0', wanted an integer"),
