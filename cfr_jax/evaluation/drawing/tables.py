@@ -51,14 +51,15 @@ def write_table(
         *_failures(measured),
         "## Time",
         "",
-        f"{about['machine']}; table of {about['date']}, commit {about['commit']}, answers of the "
-        "commits beside them. Median of the pairs: from "
-        "clouds in host memory to the motion in host memory, device-synchronized, neighbors, "
-        "normals and features included. Imports, compilation and first-call costs are apart. "
+        f"{about['machine']}; table made on {about['date']} with commit {about['commit']}; the "
+        "last column has the commits of the answers. The time is the median over the pairs, from "
+        "clouds in host memory to the motion in host memory, device-synchronized, including "
+        "neighbors, normals and features. Imports, compilation and other costs of the first call "
+        "are in the start-up column. "
         f"Versions: {', '.join(f'{k} {v}' for k, v in about['versions'].items())}.",
         "",
         *_grid(
-            ["method", "ms / pair", "start-up s", "threads", "device", "pairs a call", "commit"],
+            ["method", "ms / pair", "start-up s", "threads", "device", "pairs / call", "commit"],
             [_times(m) for m in measured],
         ),
         "",
@@ -104,9 +105,9 @@ def _apart(
     return [
         "## Without nearly symmetric shapes",
         "",
-        f"{about['nearly_symmetric']} of the pairs are of shapes that some rotation lays on "
-        "themselves about as closely as sampling can tell (`cfr_jax/evaluation/symmetry.py`, a "
-        "rule on the shape alone); the others:",
+        f"{about['nearly_symmetric']} of the pairs show shapes that fit on themselves after some "
+        "rotation, about as closely as sampling can tell (`cfr_jax/evaluation/symmetry.py`, a "
+        "rule on the shape alone). These are the others:",
         "",
         *_errors(measured, numbers, columns),
         "",
@@ -128,8 +129,8 @@ def _modules(measured: Sequence[Measured]) -> list[str]:
         for name, seconds in timed.items()
     ]
     return [
-        "Milliseconds a pair by module, each compiled alone, device-synchronized, on the threads "
-        "above; medians of a few pairs:",
+        "Milliseconds per pair by module, each compiled alone, device-synchronized, on the threads "
+        "above; medians over a few pairs:",
         "",
         *_grid(["method", *parts, "sum"], rows),
         "",
