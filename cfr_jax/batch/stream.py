@@ -20,7 +20,7 @@ from cfr_jax.geometry import units
 from cfr_jax.io import PointCloud, as_point_cloud
 from cfr_jax.refine import find
 
-# More pairs per call keep an accelerator busy, but make a CPU's caches useless.
+# More pairs per call keep an accelerator busy, but do not fit in a CPU's caches.
 ON_CPU, ON_ACCELERATOR = 1, 16
 _TARGET_CLOUDS = 4  # whole clouds from files, which may be large
 _TARGET_UNITS = 64

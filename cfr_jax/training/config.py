@@ -110,7 +110,7 @@ class TrainSection:
     # stays float32.
     precision: str = "float32"
     pairs_at_once: int = 1  # vectorized pairs per device; on an accelerator, as many as fit
-    max_skipped: int = 20  # most steps in a row without a finite gradient before it stops
+    max_skipped: int = 20  # steps in a row that may lack a finite gradient; after more, it stops
     draw: str = "host"  # where pairs are drawn: "host", or "device" for pairs of shapes
     workers: int = 1  # threads that draw pairs on the host
     steps_at_once: int = 1  # steps per program, if the device draws

@@ -99,7 +99,7 @@ class _Training:
         with stopping.stop_requests() as requests:
             for phase, ran in remaining(self.task.phases, self.about["step"]):
                 self._go_through(phase, ran, requests)
-        if not self.about["best"]:  # stopped before its first validation, and cut short since
+        if not self.about["best"]:  # stopped before any validation, and then shortened by config
             self._validate()
             self._keep_best()
         self._take_note()

@@ -189,7 +189,7 @@ def _checked(clouds: dict[str, Any]) -> Array | None:
             _check_finite(name, cloud)
         else:
             on_device.append(cloud)
-    with jax.ensure_compile_time_eval():  # concrete arrays keep their values while we are traced
+    with jax.ensure_compile_time_eval():  # concrete arrays have values even in a traced caller
         return _all_finite(on_device) if on_device else None
 
 
