@@ -229,7 +229,7 @@ def test_the_table_is_the_same_but_for_the_section_on_time():
     assert "recall 5°, 2 m" in before[0]
     assert "**icp**: not run, open3d is needed" in before[0]
     assert "**identity**, 1 pairs (2): no luck" in before[0]
-    assert "3 of the pairs are of shapes" in before[0]
+    assert "3 of the pairs show shapes" in before[0]
     assert before[0].count("| identity | 30.00 | 30.00 | 0.5000 |") == 2
 
 
