@@ -318,7 +318,7 @@ def test_answers_that_are_no_numbers_are_no_validation(monkeypatch):
     monkeypatch.setattr(step, "predict", lambda *_, **__: jax.numpy.asarray(found))
     chosen = learner.learner(config("nowhere.h5"))
 
-    with pytest.raises(stopping.Diverged, match="answers to 1 of 3 validation pairs"):
+    with pytest.raises(stopping.Diverged, match="answers of the weights to 1 of 3 validation"):
         validation.validate(chosen, {}, {}, found[:, 0], devices.make_mesh())
 
 
