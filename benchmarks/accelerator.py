@@ -1,10 +1,11 @@
 """Measures one machine in one call: python benchmarks/accelerator.py [--minutes 5]
 
-Device and versions, what its arithmetic and memory can do, `register` at several sizes and batches,
-`align`, a training step with its drawing, kernels per call, compile seconds, and whether the
-answers are those of the CPU. Writes accelerator.json and a Markdown table. With `--authors
-CHECKOUT` the authors' PyTorch programs run on the same clouds and device. Everything also runs on
-a CPU. Lines are measured in order of importance; those that no longer fit the time are named.
+It measures the limits of arithmetic and memory, `register` at several sizes and batches, `align`, a
+training step with the drawing of its pairs, kernels per call and compile seconds, and checks that
+the results agree with the CPU's. It writes accelerator.json and a Markdown table, with the device
+and versions. With `--authors CHECKOUT` the authors' PyTorch programs run on the same clouds and
+device. Everything also runs on a CPU. The most important lines are measured first; lines that no
+longer fit into the time are listed.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from cfr_jax.evaluation import machine
 HERE = Path(__file__).parent
 SIZES = ((717, 1), (12000, 1), (717, 32), (2048, 1), (4000, 1), (717, 8))
 RUNS = 15
-EACH = 30.0  # seconds that a line may need, mostly to compile
+EACH = 30.0  # seconds that a line may need, mostly for compiling
 
 
 def main() -> None:
-    """Measures line by line and writes what was found."""
+    """Measures line by line and writes the results."""
     args = _arguments()
     clock = Clock(60 * args.minutes)
     found = {
@@ -49,13 +50,13 @@ def main() -> None:
     }
 
     def add(name, measure, **about):
-        """One line; what fails is told in it and stops no other."""
+        """Measures one line. A failure is recorded in it and does not stop the others."""
         if not clock.has(EACH, name):
             return
         began = time.monotonic()
         try:
             line = measure()
-        except Exception as error:  # of any library below: the other lines must come all the same
+        except Exception as error:  # any library may fail, and the other lines must still run
             line = {"failure": f"{type(error).__name__}: {str(error)[:300]}"}
         line = {"name": name, **about, **line, "took": round(time.monotonic() - began, 1)}
         found["lines"].append(line)
@@ -103,7 +104,7 @@ def main() -> None:
 
 
 def timed(call, runs: int = RUNS) -> dict:
-    """Median and fastest milliseconds of a call whose results are waited for."""
+    """Median and fastest milliseconds of a call, including the wait for its results."""
     jax.block_until_ready(call())
     times = []
     for _ in range(runs):
@@ -114,7 +115,7 @@ def timed(call, runs: int = RUNS) -> dict:
 
 
 def roofs() -> dict:
-    """TFLOP/s of a large product by precision, and TB/s of a copy (read and written)."""
+    """TFLOP/s of a large matrix product at each precision, and TB/s of a copy (read and write)."""
     side = 8192 if jax.default_backend() != "cpu" else 2048
     key = jax.random.key(0)
     found = {}
@@ -144,7 +145,7 @@ def pair(points: int, batch: int) -> list[jax.Array]:
 
 
 def register(points: int, batch: int, given: bool = False) -> dict:
-    """The whole network on clouds with normals, neighbors searched inside unless `given`."""
+    """The whole network on clouds with normals. It searches the neighbors itself unless `given`."""
     params, arguments = cfr.load_params(), pair(points, batch)
     if given:
         arguments = [cfr.prepare(cloud) for cloud in arguments]
@@ -164,7 +165,7 @@ def register(points: int, batch: int, given: bool = False) -> dict:
 
 
 def compile_apart(program, *arguments):
-    """A jitted function lowered and compiled, with the seconds of each."""
+    """Lowers and compiles a jitted function; returns both results and the seconds of each."""
     began = time.perf_counter()
     lowered = program.lower(*arguments)
     middle = time.perf_counter()
@@ -177,7 +178,7 @@ def compile_apart(program, *arguments):
 
 
 def align() -> dict:
-    """`align` from arrays in host memory, both clouds at its default budget."""
+    """`align` on arrays in host memory, with both clouds at its default budget."""
     source, target = clouds.pair(1024)
     first = cfr.align(source, target, second_look=False)
     found = timed(lambda: cfr.align(source, target, second_look=False).transform)
@@ -185,8 +186,10 @@ def align() -> dict:
 
 
 def agreement() -> dict:
-    """Largest difference of the transforms from the CPU's, at full precision, and whether the same
-    call twice gives the same bits."""
+    """Largest difference between the device's and the CPU's transforms, at full precision.
+
+    Also says whether the same call gives the same bits twice.
+    """
     params, arguments = cfr.load_params(), pair(717, 1)
 
     def solve(params, source, target):
@@ -205,7 +208,7 @@ def agreement() -> dict:
 
 
 def training(precision: str, batch: int, steps: int) -> dict:
-    """A training step at full size on pairs that the device draws, and the drawing's share."""
+    """A full-size training step on pairs drawn on the device, and the share of the drawing."""
     sizes = {"points": 717, "neighbors": 64, "batch": batch, "steps": steps, "repeats": 3}
     found = train_drawn.measure(precision, **sizes)
     alone = train_drawn.measure_drawing(**sizes)["ms_per_step"]
@@ -214,7 +217,7 @@ def training(precision: str, batch: int, steps: int) -> dict:
 
 
 def authors(checkout: Path, points: int, batch: int) -> dict:
-    """The authors' program on the same clouds, on the GPU where there is one."""
+    """The authors' program on the same clouds, on the GPU if there is one."""
     rows = [np.asarray(cloud).reshape(batch, points, 6) for cloud in pair(points, batch)]
     device = "cuda" if jax.default_backend() == "gpu" else "cpu"
     with tempfile.TemporaryDirectory() as folder:
@@ -240,16 +243,16 @@ def as_table(found: dict) -> str:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--minutes", type=float, default=5.0, help="begin nothing after so many")
+    parser.add_argument("--minutes", type=float, default=5.0, help="start no line after this time")
     parser.add_argument("--out", type=Path, default=HERE / "results" / "accelerator.json")
     parser.add_argument(
         "--training", type=int, nargs="*", default=[64], metavar="BATCH",
-        help="batch sizes of the training steps; none to leave them out",
+        help="batch sizes of the training steps; give none to skip them",
     )  # fmt: skip
     parser.add_argument("--steps", type=int, default=10, help="training steps in one program")
     parser.add_argument(
         "--authors", type=Path, action="append", default=[], metavar="CHECKOUT",
-        help="of the authors' CFR or RPM-Net in PyTorch; may be given twice",
+        help="a checkout of the authors' CFR or RPM-Net in PyTorch; may be given twice",
     )  # fmt: skip
     return parser.parse_args()
 

@@ -1,6 +1,7 @@
-"""What is measured in this process: whole registrations, modules, the paper's speed-ups, batches.
+"""The cases measured in this process: whole registrations, modules, the paper's speed-ups, batches.
 
-A case is a name, its arithmetic, and a function that makes the call; making it may compile.
+A case has a name, an amount of arithmetic, and a function that makes the call to measure. Making
+the call may compile.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ SETTINGS = cfr.Settings()
 
 @dataclass(frozen=True)
 class Case:
-    """Something to measure."""
+    """One thing to measure."""
 
     group: str
     name: str
     points: int
     make: Callable[[], tuple[Call, float]]
-    """The call, and the seconds that compiling it took."""
+    """Returns the call, and the seconds that compiling it took."""
     flop: float | None = None
     batch: int = 1
     settings: dict = field(default_factory=dict)
@@ -47,7 +48,7 @@ def search(points):
 
 
 def prepared(count: int) -> tuple[registration.Cloud, registration.Cloud]:
-    """Both clouds with neighbors and estimated normals, on the device."""
+    """Both clouds on the device, with neighbors and estimated normals."""
     x, y = (cfr.prepare(cloud, neighbors=search(cloud)) for cloud in clouds.pair(count))
     return x, y
 
@@ -70,7 +71,7 @@ def whole(sizes: tuple[int, ...]) -> Iterator[Case]:
 
 
 def modules(count: int) -> Iterator[Case]:
-    """Each module alone, on both clouds where both go through it."""
+    """Each module alone, on both clouds if both pass through it."""
     params = cfr.load_params()
     x, y = clouds.pair(count)
     a, b = prepared(count)
@@ -155,7 +156,7 @@ def modules(count: int) -> Iterator[Case]:
     )
 
 
-# What the paper saves, each put back alone.
+# The work that the paper saves; each case adds back one part of it.
 ABLATIONS = {
     "as it is": {},
     "features again in every iteration": {"repeat_extraction": True},
@@ -167,7 +168,7 @@ ABLATIONS = {
 
 
 def ablations(count: int) -> Iterator[Case]:
-    """The network on prepared clouds, each of the paper's speed-ups off."""
+    """The network on prepared clouds, with one of the paper's speed-ups turned off at a time."""
     params = cfr.load_params()
     for name, options in ABLATIONS.items():
         settings = dataclasses.replace(SETTINGS, **options)
@@ -182,7 +183,7 @@ def ablations(count: int) -> Iterator[Case]:
 
 
 def networks(count: int) -> Iterator[Case]:
-    """Our RPM-Net, as published and optimized, fresh parameters: time does not depend on them."""
+    """Our RPM-Net, published and optimized, with fresh parameters (they do not affect the time)."""
     params = rpmnet.init_params(jax.random.key(0))
     for name, optimized in (("RPM-Net (Optim), ours", True), ("RPM-Net as published, ours", False)):
         settings = rpmnet.RPMNetSettings(optimized=optimized)
@@ -197,7 +198,7 @@ def networks(count: int) -> Iterator[Case]:
 
 
 def batches(count: int, sizes: tuple[int, ...]) -> Iterator[Case]:
-    """The network on a batch of prepared pairs, by `vmap`."""
+    """The network on a batch of prepared pairs, with `vmap`."""
     params = cfr.load_params()
     flop = cost.pair(count, count)
 

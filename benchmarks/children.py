@@ -1,4 +1,4 @@
-"""What needs a fresh process: peak memory, and how long the command takes to start."""
+"""Measurements that need a fresh process: peak memory, and start-up time of the command."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ _JAX = ("-c", "import jax; jax.numpy.ones(3).sum()")
 
 
 def peak_memory(count: int, timeout: float) -> dict:
-    """Peak of a process that registers one pair of `count` points, and of one that only imports;
-    mebibytes. Neighbors on the host, normals estimated. (Linux: from /proc.)"""
+    """Peak memory, in mebibytes, of registering one pair of `count` points and of imports alone.
+
+    Neighbors are found on the host and normals are estimated. Works on Linux only (it reads /proc).
+    """
     peaks = {}
     for name, points in (("imports", 0), ("register", count)):
         child = subprocess.run(
@@ -30,8 +32,10 @@ def peak_memory(count: int, timeout: float) -> dict:
 
 
 def start_up(runs: int) -> dict:
-    """Seconds of `cfr register` on the demo pair, its cache warm, beside a process that imports JAX
-    and adds three numbers; alternating, medians."""
+    """Median seconds of `cfr register` on the demo pair with a warm cache.
+
+    They are compared with a process that imports JAX and adds three numbers. The two alternate.
+    """
     folder = Path(cfr.__file__).parent
     pair = [str(folder / "cli" / "demo_pair" / f"{name}.ply") for name in ("source", "target")]
     with tempfile.TemporaryDirectory() as cache:
@@ -62,7 +66,7 @@ def start_up(runs: int) -> dict:
 
 
 def _register(count: int) -> float:
-    """In the child: registers, and tells the peak."""
+    """Runs in the child: registers, and returns the peak memory in mebibytes."""
     if count:
         import clouds
         import jax
@@ -75,7 +79,7 @@ def _register(count: int) -> float:
 
         cfr.load_params()
         jax.numpy.ones(3).sum().block_until_ready()
-    # not getrusage: its peak begins with that of the process that forked this one
+    # not getrusage, whose peak includes that of the process that forked this one
     status = Path("/proc/self/status").read_text().splitlines()
     return next(float(line.split()[1]) for line in status if line.startswith("VmHWM")) / 1024
 

@@ -1,4 +1,4 @@
-"""The pairs that are timed: the two views that ship with the package, at any number of points."""
+"""The pairs to time: the two views that ship with the package, at any number of points."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 import cfr_jax as cfr
 from cfr_jax import io
 
-_NOISE = 0.002  # of the radius: no two points agree where a view is drawn from twice
+_NOISE = 0.002  # share of the radius; makes points differ if a point is drawn more than once
 
 
 @functools.cache
 def pair(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Source and target, (count, 3) float32 in the unit sphere; the same ones every time."""
+    """Source and target, (count, 3) float32 in the unit sphere; always the same for one count."""
     folder = Path(cfr.__file__).parent / "cli" / "demo_pair"
     rng = np.random.default_rng(count)
     clouds = []

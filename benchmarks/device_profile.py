@@ -1,4 +1,4 @@
-"""What a call does on an accelerator, by JAX's own profiler: kernels and how long they take."""
+"""The kernels of a call on an accelerator and their times, from JAX's own profiler."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 
 import jax
 
-_MOST = 6  # kinds of kernels that are named
+_MOST = 6  # kinds of kernels that are listed
 
 
 def profile(call: Callable[[], object]) -> dict:
-    """Kernels of one call, the milliseconds that they take together, and those that take the most.
+    """The number of kernels in one call, their total milliseconds, and the slowest kinds.
 
     Empty on a CPU, which has no kernels.
     """

@@ -1,12 +1,12 @@
-"""What large clouds take: python benchmarks/large.py [--points 3000 12000 30000 100000]
+"""Time and memory for large clouds: python benchmarks/large.py [--points 3000 12000 30000 100000]
 
-Each size runs in a process of its own, so that the peak memory is that of one registration, Python
-and JAX included. The clouds are a lumpy analytic surface, sampled twice and moved; nothing is read
-but the weights that ship. Run it on a machine that does nothing else.
+Each size runs in its own process, so that the peak memory is that of one registration, including
+Python and JAX. The clouds are a lumpy analytic surface, sampled twice and moved. Only the shipped
+weights are read. Run it on a machine that does nothing else.
 
-`register` is the network on all points, neighbors searched on the host; its match is streamed from
-2^25 affinities on: iteration i makes the block i + 1 times, 20 times in all. `align` thins to its
-budget first, and with `all points` refines on every point afterwards.
+`register` is the network on all points, with neighbors found on the host. From 2^25 affinities on,
+its match is streamed: iteration i computes the block i + 1 times, which is 20 times in all. `align`
+thins to its budget first. With `all points` it then refines on every point.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ WHAT = ("register", "align", "align all points")
 
 
 def main() -> None:
-    """Prints a line per size: seconds, memory, the error of the answer, and how time grows."""
+    """Prints one line per size: seconds, memory, the error of the result, and the time's growth."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, nargs="+", default=[3000, 12_000, 30_000, 100_000])
     parser.add_argument("--what", nargs="+", choices=WHAT, default=WHAT)
@@ -105,7 +105,7 @@ def registered(source: np.ndarray, target: np.ndarray) -> dict:
 
 
 def aligned(source: np.ndarray, target: np.ndarray, *, all_points: bool) -> dict:
-    """`align`, at its usual budget."""
+    """`align` at its default budget."""
     import cfr_jax as cfr
 
     found = cfr.align(source, target, all_points=all_points)
@@ -119,7 +119,7 @@ def aligned(source: np.ndarray, target: np.ndarray, *, all_points: bool) -> dict
 
 
 def pair(points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A surface sampled twice, the source turned by 30 degrees; the truth maps it back."""
+    """A surface sampled twice, with the source moved by 30 degrees; the truth maps it back."""
     rng = np.random.default_rng(0)
     axis = np.array([0.6, 0.64, 0.48])
     cross = np.array(
@@ -134,7 +134,7 @@ def pair(points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def lumpy_surface(points: int, rng: np.random.Generator) -> np.ndarray:
-    """Points of a body without symmetry, in the unit sphere."""
+    """Points on a body without symmetry, in the unit sphere."""
     direction = rng.normal(size=(points, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     x, y, z = direction.T

@@ -1,14 +1,14 @@
-"""Other methods on the same pair: those that are installed, and the authors' own programs.
+"""Other methods on the same pair: installed ones, and the programs of the papers' authors.
 
-The authors' programs are not part of this project; `--authors FOLDER` names a checkout, given once
-for each. Known are the public layouts of
+The authors' programs are not part of this project. `--authors FOLDER` names a checkout, once for
+each program. These public layouts are known:
 
 - CFR, github.com/yoichiro0406/cascading_feature_extraction: `src/models/cfenet.py`,
-- RPM-Net, github.com/yewzijian/RPMNet: `src/models/rpmnet.py`,
+- RPM-Net, github.com/yewzijian/RPMNet: `src/models/rpmnet.py`.
 
-which are imported, given fresh parameters (time does not depend on them) and called as their own
-`eval.py` does. Both bring packages of the same names, so each runs in a process of its own, with as
-many threads as this one, and sends its times back. They need torch and what they import.
+The models are imported, get fresh parameters (which do not affect the time), and are called as in
+their own `eval.py`. Both have packages of the same names, so each runs in its own process, with as
+many threads as this one, and sends its times back. They need torch and the packages they import.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _KNOWN = {"cfenet": "CFR, the authors' PyTorch", "rpmnet": "RPM-Net, its authors
 
 
 def installed() -> Iterator[tuple[str, dict]]:
-    """Names of `evaluation.baselines` that can be used here, with options for the unit sphere."""
+    """The `evaluation.baselines` that are installed, by name, with options for the unit sphere."""
     from cfr_jax.runtime.optional import require
 
     local = {"distances": (0.2, 0.1, 0.05), "start": "centroid"}
@@ -52,8 +52,11 @@ def installed() -> Iterator[tuple[str, dict]]:
 def authors(
     checkout: Path, source: np.ndarray, target: np.ndarray, folder: Path, device: str = "cpu"
 ) -> dict:
-    """Times of the program in `checkout` on these pairs (b, n, 6), points with normals, on "cpu" or
-    "cuda": its name, and either `milliseconds` of each run or `failure`, why there are none."""
+    """Times of the program in `checkout` on these pairs (b, n, 6), points with normals.
+
+    `device` is "cpu" or "cuda". The result has the program's name, and either `milliseconds` of
+    each run or `failure`, the reason why there are none.
+    """
     path = folder / "pair.npz"
     np.savez(path, source=source, target=target)
     child = subprocess.run(
@@ -69,7 +72,7 @@ def authors(
 
 
 def _run(checkout: Path, pair: Path, device: str) -> dict:
-    """In the child: imports the model, builds it, times it."""
+    """Runs in the child: imports, builds and times the model."""
     import torch
 
     root = checkout / "src" if (checkout / "src").is_dir() else checkout

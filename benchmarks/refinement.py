@@ -1,10 +1,11 @@
-"""How near the refinement comes to what it reaches when it starts at the truth.
+"""Compares the refinement from the network's answer with the refinement from the truth.
 
     python -m benchmarks.refinement --corpus data/open_cad/val.h5 --pairs 60
 
-Pairs of the partial protocol with exact normals. `refine` starts at the network's answer, and its
-descent at the truth, which it leaves (`refine` would keep a start that scores better); told are the
-errors of both, over the pairs whose start lies in its basin: within 15 degrees and 0.3 radii.
+The pairs are those of the partial protocol, with exact normals. `refine` starts at the network's
+answer. From the truth only its descent runs, because `refine` would keep a start that scores
+better. The script prints the errors of both, over the pairs whose start lies in the basin of
+convergence: within 15 degrees and 0.3 radii.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def main() -> None:
     keep_compiled_programs()
     corpus = read_corpus(args.corpus)
     truths, starts, ends = [], [], {"network": [], "truth": []}
-    # spread over the corpus, which is sorted by category
+    # spread evenly over the corpus
     for index in tqdm.tqdm(np.linspace(0, len(corpus) - 1, args.pairs).astype(int)):
         pair = fixed_pair(corpus, int(index), partial)
         clouds = (

@@ -1,4 +1,4 @@
-"""The result file as tables and graphs: python benchmarks/report.py results/speed.json"""
+"""Turns the result file into tables and graphs: python benchmarks/report.py results/speed.json"""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def write(told: dict, out: Path, images: Path) -> None:
-    """`speed.md` into `out`, and the graphs into `images`, if there is matplotlib."""
+    """Writes `speed.md` into `out` and, if matplotlib is installed, the graphs into `images`."""
     (out / "speed.md").write_text(tables(told), encoding="utf-8")
     try:
         import matplotlib
@@ -25,7 +25,7 @@ def write(told: dict, out: Path, images: Path) -> None:
 
 
 def tables(told: dict) -> str:
-    """All of it, ratios first."""
+    """All tables as Markdown, with ratios first."""
     lines = told["lines"]
     whole = [line for line in lines if line["group"] == "whole pair"]
     first = whole[0] if whole else None
@@ -123,7 +123,7 @@ def _batches(lines):
 
 
 def _draw_sizes(told, path):
-    """Time against points, beside what the cost model predicts at the share of 717 points."""
+    """Plots time against points, and the cost model's prediction at the share of 717 points."""
     import matplotlib.pyplot as plt
 
     whole = [line for line in told["lines"] if line["group"] == "whole pair"]
@@ -151,7 +151,7 @@ def _draw_sizes(told, path):
 
 
 def _draw_modules(told, path):
-    """Where the time of a pair goes, and the share of the roof of each part."""
+    """Plots the time of each part of a pair, and its share of the roof."""
     import matplotlib.pyplot as plt
 
     skip = ("bfloat16", "by ", "on the device")

@@ -1,8 +1,8 @@
-"""How fast, and how near to what the machine can do: python benchmarks/run.py [--quick]
+"""Measures speed, also as a share of what the machine can do: python benchmarks/run.py [--quick]
 
-Writes benchmarks/results/speed.json, the tables speed.md beside it, and graphs into docs/images.
-Run it on a machine that does nothing else: every line tells the large matrix product (the roof)
-that ran in between its runs, so that a disturbed line can be seen.
+It writes benchmarks/results/speed.json, the tables in speed.md next to it, and graphs into
+docs/images. Run it on a machine that does nothing else. A large matrix product (the roof) is timed
+between the runs of every line and reported with it, so that a disturbed line can be noticed.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ SIZES = (717, 2048, 4096, 12000)
 LONG = (30000, 100000)
 QUICK = (717, 2048, 4096)
 BATCHES = (1, 2, 4, 8, 16, 32, 64)
-RESERVE = 30.0  # seconds a case may need that nothing is known of: most of it compiles
+RESERVE = 30.0  # seconds that an unknown case may need, mostly for compiling
 
 
 def main() -> None:
-    """Measures group by group, the most telling first, until the time is up."""
+    """Measures group by group, the most important first, until the time is up."""
     args = _arguments()
     began = time.monotonic()
     clock = Clock(60 * args.minutes)
@@ -75,7 +75,7 @@ def main() -> None:
         _print(line)
     lines += list(_peers(args, roof, clock))
     told |= {"start_up": None, "memory": []}
-    _save(told, lines, args.out, began)  # what follows starts other processes, and may be stopped
+    _save(told, lines, args.out, began)  # saved now, because the processes below may be stopped
     if clock.has(2 * RESERVE, "start-up"):
         told["start_up"] = children.start_up(5 if args.quick else args.runs)
         print(f"start-up {told['start_up']}")
@@ -94,7 +94,7 @@ def _save(told: dict, lines: list[Line], out: Path, began: float) -> None:
 
 
 def planned(args: argparse.Namespace) -> Iterator[cases.Case]:
-    """The cases of this process, in order."""
+    """The cases that are measured in this process, in order."""
     sizes = QUICK if args.quick else SIZES
     yield from cases.whole(sizes[:1])
     yield from cases.networks(cases.PAPER)
@@ -156,12 +156,12 @@ def _print(line: Line) -> Line:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer sizes and batches")
-    parser.add_argument("--long", action="store_true", help="30,000 and 100,000 points, too")
-    parser.add_argument("--minutes", type=float, default=60.0, help="begin nothing after so many")
-    parser.add_argument("--runs", type=int, default=9, help="of which the median is told")
+    parser.add_argument("--long", action="store_true", help="also 30,000 and 100,000 points")
+    parser.add_argument("--minutes", type=float, default=60.0, help="start no case after this time")
+    parser.add_argument("--runs", type=int, default=9, help="runs per case, for the median")
     parser.add_argument(
         "--authors", type=Path, action="append", default=[], metavar="CHECKOUT",
-        help="of the authors' CFR or RPM-Net in PyTorch; may be given twice",
+        help="a checkout of the authors' CFR or RPM-Net in PyTorch; may be given twice",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, default=HERE / "results")
     parser.add_argument("--images", type=Path, default=HERE.parent / "docs" / "images")

@@ -1,4 +1,5 @@
-"""Medians of interleaved runs, each beside a large matrix product: the machine's roof just then."""
+"""Medians of runs, interleaved with a large matrix product that gives the machine's current
+roof."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_SIDE = 2048  # of the product: 17 GFLOP
+_SIDE = 2048  # of the square matrices in the product, which takes 17 GFLOP
 
 
 @dataclass
@@ -23,48 +24,48 @@ class Line:
     batch: int
     runs: int
     milliseconds: float
-    """Median of the runs, of the whole batch."""
+    """Median over the runs, for the whole batch."""
     fastest: float
     compile_seconds: float
     gflop: float | None
     roof: float
-    """GFLOP/s of a large float32 product, median of those run in between."""
+    """GFLOP/s of a large float32 product, median of the products run in between."""
     share: float | None
-    """Of the roof that the arithmetic reaches."""
+    """Share of the roof that the arithmetic reaches."""
     settings: dict = field(default_factory=dict)
 
     def as_dict(self) -> dict:
-        """For the result file."""
+        """The line as a dict for the result file."""
         return asdict(self)
 
 
 def program(function: Callable, *arguments) -> tuple[Callable, float]:
-    """`function` for arguments of these shapes, and the seconds that compiling took."""
+    """`function` compiled for arguments of these shapes, and the seconds that compiling took."""
     began = time.perf_counter()
-    # a bound network cannot be hashed, as jit would
+    # in a lambda, because jit hashes its function and a bound network cannot be hashed
     made = jax.jit(lambda *given: function(*given)).lower(*arguments).compile()
     return made, time.perf_counter() - began
 
 
 def compiled(function: Callable, *arguments) -> tuple[Callable[[], object], float]:
-    """The same as a call on these arguments."""
+    """The same, as a call on these arguments."""
     made, seconds = program(function, *arguments)
     return (lambda: made(*arguments)), seconds
 
 
 class Clock:
-    """What is left of the time, and what had no place in it."""
+    """The time that is left, and the cases that no longer fit into it."""
 
     def __init__(self, seconds: float):
         self.end = time.monotonic() + seconds
         self.left_out: list[str] = []
 
     def left(self) -> float:
-        """Seconds."""
+        """The seconds that are left."""
         return max(0.0, self.end - time.monotonic())
 
     def has(self, seconds: float, what: str) -> bool:
-        """Whether so many are left; if not, `what` is left out."""
+        """Whether this many seconds are left. If not, `what` is recorded as left out."""
         if self.left() >= seconds:
             return True
         self.left_out.append(what)
@@ -72,7 +73,7 @@ class Clock:
 
 
 class Roof:
-    """A float32 product that is large enough to show what the cores can do."""
+    """A float32 matrix product that is large enough to show what the cores can do."""
 
     def __init__(self):
         self._matrix = jnp.asarray(np.random.default_rng(0).random((_SIDE, _SIDE), np.float32))
@@ -85,7 +86,7 @@ class Roof:
 
 
 def timed(call: Callable[[], object]) -> float:
-    """Seconds of one call, its results waited for."""
+    """Seconds of one call, including the wait for its results."""
     began = time.perf_counter()
     jax.block_until_ready(call())
     return time.perf_counter() - began
@@ -105,10 +106,11 @@ def measure(
     limit: float = 60.0,
     settings: dict | None = None,
 ) -> Line:
-    """At most `runs` runs, fewer where they take longer than `limit` seconds.
+    """Measures at most `runs` runs, fewer if they take longer than `limit` seconds.
 
-    Each comes after a run that is not counted, where that is short: the product before it, 50 MB,
-    has emptied the caches. A call that takes longer than a quarter of the limit is not warmed up.
+    If a run is short, an uncounted run precedes each counted one, because the product in between
+    (50 MB) has emptied the caches. A call that takes longer than a quarter of the limit is not
+    warmed up.
     """
     began = time.perf_counter()
     times, roofs = [timed(call)], [roof.measure()]

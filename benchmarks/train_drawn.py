@@ -1,8 +1,9 @@
-"""How many pairs a second are trained on that the device draws: python benchmarks/train_drawn.py
+"""Training speed on pairs that the device draws: python benchmarks/train_drawn.py
 
-For each precision: seconds to compile, pairs per second of several steps in one program with the
-drawing of their pairs, and what share of that time the drawing alone takes. Made for accelerators;
-`--points 64 --neighbors 12 --batch 4 --steps 2` is enough to try it on a CPU.
+For each precision it measures the seconds to compile, the pairs per second of one program that
+draws pairs and trains on them for several steps, and the share of that time that the drawing takes.
+It is made for accelerators; `--points 64 --neighbors 12 --batch 4 --steps 2` is enough to try it on
+a CPU.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=717)
     parser.add_argument("--neighbors", type=int, default=64)
     parser.add_argument("--batch", type=int, default=64)
-    parser.add_argument("--steps", type=int, default=25, help="in one program")
-    parser.add_argument("--repeats", type=int, default=4, help="of that program, timed")
+    parser.add_argument("--steps", type=int, default=25, help="training steps in one program")
+    parser.add_argument("--repeats", type=int, default=4, help="timed runs of that program")
     parser.add_argument("--precisions", nargs="+", default=step.PRECISIONS[::-1])
     args = parser.parse_args()
     print(f"{len(jax.devices())} x {jax.devices()[0].device_kind}, jax {jax.__version__}")
@@ -48,7 +49,7 @@ def main() -> None:
 def measure(
     precision: str, *, points: int, neighbors: int, batch: int, steps: int, repeats: int
 ) -> dict:
-    """Compiling, and the steady rate of training in `precision` over all devices."""
+    """Compile times, and the steady rate of training in `precision` on all devices."""
     mesh = devices.make_mesh()
     schedule = optimizers.make_schedule("trapezoid", peak_rate=1e-3, steps=10_000, warmup=0.02)
     optimizer = optimizers.make_optimizer("muon", schedule, clip=1.0, weight_decay=1e-5)
@@ -85,7 +86,7 @@ def measure(
     seconds = (time.perf_counter() - begun) / (repeats * steps)
     held = [state]
 
-    def stretch():  # the state is donated, so each call hands on the next one
+    def stretch():  # the state is donated, so each call passes the new one on
         held[0], measured = program(held[0], *given)
         return measured.total
 
@@ -109,7 +110,7 @@ def measure(
 
 
 def measure_drawing(*, points: int, neighbors: int, batch: int, steps: int, repeats: int) -> dict:
-    """The drawing of pairs alone, on one device: its share of a batch."""
+    """The time to draw one device's share of a batch, without training."""
     mesh = devices.make_mesh()
     shapes, seed, items, positions = _placed(batch, steps, mesh)
     share = batch // mesh.size
@@ -132,7 +133,7 @@ def measure_drawing(*, points: int, neighbors: int, batch: int, steps: int, repe
 
 
 def _sampling(points: int, neighbors: int) -> Sampling:
-    """That of configs/object.py."""
+    """The sampling of configs/object.py."""
     return Sampling(
         points=points, neighbors=neighbors, keep=(0.55, 0.85), both_ways=0.5, near=0.3,
         centered=0.4, any_orientation=0.3, scale=(0.8, 1.2), estimated_normals=0.6,

@@ -1,11 +1,11 @@
-"""How long a training step takes, beside the naive one: python benchmarks/train_step.py
+"""Compares a training step with a naive one: python benchmarks/train_step.py
 
-The naive step is what one writes first: neighbors by `top_k` on the device, the per-neighbor MLP
-as plain matrix products and norms, `vmap` over the batch, `jax.grad` of the mean loss. Both have
-the same loss, network and optimizer, and must give the same loss. Ours gets its neighbors from the
-host, whose time is counted here though in training it runs ahead, and on a CPU a device of each
-core, as `train.py` does; the naive one has all cores for its one device. Run it on a machine that
-does nothing else.
+The naive step is the obvious program: neighbors by `top_k` on the device, the per-neighbor MLP as
+plain matrix products and norms, `vmap` over the batch, and `jax.grad` of the mean loss. Both have
+the same network, optimizer and loss, and must give the same loss value. Our step gets its neighbors
+from the host; their time is counted here, although in training the host works ahead. On a CPU, our
+step has one device per core, as in `train.py`, and the naive step has one device with all cores.
+Run it on a machine that does nothing else.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from cfr_jax.training.losses import pair_loss
 
 
 def main() -> None:
-    """Prints the losses of both, and the milliseconds of a step."""
+    """Prints the losses of both steps and their milliseconds."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, default=358)
     parser.add_argument("--neighbors", type=int, default=32)
@@ -93,7 +93,7 @@ def main() -> None:
 
 
 def ellipsoids() -> Corpus:
-    """Sixteen shapes of 2048 points with their normals."""
+    """Sixteen shapes of 2048 points with normals."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(16, 2048, 3))
     points /= np.linalg.norm(points, axis=-1, keepdims=True)
@@ -111,7 +111,7 @@ def ellipsoids() -> Corpus:
 
 @functools.partial(jax.jit, static_argnames=("optimizer", "neighbors"), donate_argnames=("state",))
 def naive_step(state: step.TrainState, *, batch, optimizer, neighbors):
-    """The same step without any of what makes ours fast."""
+    """The same step without our optimizations."""
 
     def loss(params, pair):
         clouds = [
@@ -136,7 +136,7 @@ def naive_step(state: step.TrainState, *, batch, optimizer, neighbors):
 
 
 def by_top_k(points, count, radius):
-    """The nearest others; those beyond the radius replaced by the nearest."""
+    """The nearest other points; those beyond the radius are replaced by the nearest one."""
     square = jnp.sum((points[:, None] - points[None]) ** 2, axis=-1)
     square = jnp.where(jnp.eye(len(points), dtype=bool), jnp.inf, square)
     near, found = jax.lax.top_k(-square, count)
@@ -158,14 +158,14 @@ def plain_layer(layer, x, *, groups, mask=None):
 
 
 def start(optimizer, mesh) -> step.TrainState:
-    """A state at step zero, on these devices."""
+    """A training state at step zero, on these devices."""
     return devices.replicate(
         step.init_state(network.init_params(jax.random.key(0)), optimizer), mesh
     )
 
 
 def measure(what: str, advance: Callable, state, repeats: int) -> tuple[float, float]:
-    """Median milliseconds of a step, the compiling one left out, and the first step's loss."""
+    """Median milliseconds of a step, without the first one, which compiles, and the first loss."""
     times, used, losses = [], [], []
     for _ in range(repeats + 1):
         began, worked = time.perf_counter(), time.process_time()

@@ -1,10 +1,10 @@
-"""Fits the confidence of weights that ship, in place, and tells their card of the new digest.
+"""Fits the confidence of shipped weights in place, and updates the digest on their card.
 
     python -m tools.fit_confidence object --data ../shared/data/open_cad/val.h5 --pairs 500
     python -m tools.fit_confidence scan --data scan_val.h5 --pairs 200   # tools/make_scan_pairs.py
 
-This is `cfr calibrate` for the files in cfr_jax/weights/shipped: same options, without --out. How
-well the result holds on others, `cfr calibrate NAME --data DATA --check` measures.
+This is `cfr calibrate` for the files in cfr_jax/weights/shipped. It has the same options, except
+--out. `cfr calibrate NAME --data DATA --check` measures how well the result holds on other data.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cfr_jax.weights.files import SHIPPED, read_weights
 
 
 def main() -> int:
-    """Rewrites `NAME.safetensors`, and the digest where its card and its description have it."""
+    """Rewrites `NAME.safetensors`, and the digest in its card and its description."""
     name, *options = sys.argv[1:]
     before = read_weights(name).sha256
     with tempfile.TemporaryDirectory(dir=SHIPPED) as folder:

@@ -2,8 +2,8 @@
 
     python tools/make_demo_pair.py PACKAGE_OR_LIBRARY [--out cfr_jax/cli/demo_pair]
 
-takes `sweethome3d-furniture_1.8-1_all.deb` (`apt-get download sweethome3d-furniture`), or the
-`BlendSwap-CC-0.sh3f` in it. The category of the object, vehicles, is not among those trained on.
+The argument is `sweethome3d-furniture_1.8-1_all.deb` (`apt-get download sweethome3d-furniture`), or
+the file `BlendSwap-CC-0.sh3f` in it. The object's category, vehicles, is not used for training.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from cfr_jax.io.mesh import Mesh
 
 PIECE = "Blend Swap CC-0#forkLift"
 LIBRARY = "usr/share/sweethome3d/furniture/BlendSwap-CC-0.sh3f"
-POINTS = 6000  # a view
-DENSE = 400_000  # points on the whole surface, of which a camera sees some
-NOISE = 0.01  # meters, standard deviation: a time-of-flight camera at this distance
-DISTANCE = 6.0  # meters from the sensor to the object's middle
-CELL = 0.004  # width of a pixel of the depth image by its depth
+POINTS = 6000  # per view
+DENSE = 400_000  # points on the whole surface, some of which the camera sees
+NOISE = 0.01  # meters, standard deviation; typical of a time-of-flight camera at this distance
+DISTANCE = 6.0  # meters from the sensor to the object's center
+CELL = 0.004  # width of a pixel of the depth image divided by its depth
 SEED = 7
 
-# Where the two sensors stand about the object. Angles about x, y, z in degrees (R = Rx Ry Rz
-# turns the object before the sensor), and how far it stands off the line of sight, in meters.
+# The poses of the object in front of the two sensors: angles about x, y, z in degrees
+# (R = Rx Ry Rz), and the offset from the line of sight in meters.
 SOURCE_VIEW = ((24.0, 36.0, 7.0), (0.25, -0.10, 0.15))
 TARGET_VIEW = ((14.0, -6.0, 0.0), (-0.20, 0.05, 0.0))
 
@@ -80,7 +80,7 @@ def main() -> None:
 
 
 def fork_lift(package: Path) -> tuple[Mesh, str, str]:
-    """The mesh in meters, the object's name, and its author's."""
+    """The mesh in meters, the object's name, and its author's name."""
     with tempfile.TemporaryDirectory() as folder:
         if package.suffix == ".deb":
             (package,) = extract(package, lambda name: name == LIBRARY, Path(folder))
@@ -92,7 +92,7 @@ def fork_lift(package: Path) -> tuple[Mesh, str, str]:
 def sensor_pose(
     angles: tuple[float, float, float], offset: tuple[float, float, float]
 ) -> Float[np.ndarray, "4 4"]:
-    """Object to sensor: the sensor at the origin looks along -z, y up."""
+    """The motion from the object's frame to the sensor's, which looks along -z with y up."""
     (cx, cy, cz), (sx, sy, sz) = np.cos(np.radians(angles)), np.sin(np.radians(angles))
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -113,13 +113,13 @@ def scan(
 
 
 def visible(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Points of a depth image that lie no deeper than the pixel's nearest, by a small margin."""
+    """Which points a depth camera sees: those about as near as the nearest in their pixel."""
     depth = -points[:, 2]
     column, row = np.floor(points[:, :2] / depth[:, None] / CELL).astype(int).T
     pixel = (row - row.min()) * (np.ptp(column) + 1) + column - column.min()
     nearest = np.full(pixel.max() + 1, np.inf)
     np.minimum.at(nearest, pixel, depth)
-    # A pixel sees a slanted face over some depth.
+    # On a slanted face, one pixel covers a range of depths.
     return depth < nearest[pixel] + 2.5 * CELL * DISTANCE
 
 

@@ -1,10 +1,10 @@
-"""Makes the shapes that `cfr reproduce` measures on, from CC0 models in Debian.
+"""Makes the shapes for `cfr reproduce` from CC0 models in Debian.
 
     apt-get download sweethome3d-furniture && python tools/make_held_out.py *.deb
 
-They are the shapes of the open corpus' `test.h5` (categories that no network was trained on) that
-their authors released under CC0: the library BlendSwap-CC-0. Points and normals are sampled as for
-the corpus, and kept as integers.
+They are the CC0 shapes in the open corpus' `test.h5`, whose categories no network was trained on.
+All of them come from the library BlendSwap-CC-0. Points and normals are sampled as for the corpus,
+and stored as integers.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from cfr_jax.runtime.atomic import write_atomically
 LIBRARY = "usr/share/sweethome3d/furniture/BlendSwap-CC-0.sh3f"
 STEM = "BlendSwap-CC-0"
 POINTS = 2048
-# What of the library is in test.h5: other pieces of these categories were left out there as flat,
-# as copies, or as near copies of shapes that were trained on.
+# The pieces of the library that are in test.h5. Other pieces of these categories were left out
+# there because they are flat, copies, or near copies of training shapes.
 PIECES = (
     "armchair bidet chair chair2 couch2 designChair desklamp forkLift glassDoorCabinet lamp2 "
     "modernVanity outdoorLamp plasticChair relaxChair shower showerDoor silla2 sillaBlanca sofa2 "
@@ -36,14 +36,16 @@ PIECES = (
 CREDITS = """\
 # The held-out shapes
 
-`held_out.npz` holds {count} point clouds, sampled from models that their authors released under
-CC0 1.0 (public domain dedication, https://creativecommons.org/publicdomain/zero/1.0/) on
-blendswap.com. They were taken from Debian's package `sweethome3d-furniture` 1.8-1,
-`{library}`, and are released under CC0 1.0 as well.
+`held_out.npz` holds {count} point clouds, sampled from models that their authors released on
+blendswap.com under CC0 1.0 (public domain dedication,
+https://creativecommons.org/publicdomain/zero/1.0/). The models come from
+`{library}` in Debian's package
+`sweethome3d-furniture` 1.8-1. The point clouds are also released under CC0 1.0.
 
-Made by `tools/make_held_out.py`: {points} points a shape, drawn by area, with the normals of
-their faces, centered and scaled into the unit sphere; coordinates times 32767 as int16, normals
-times 127 as int8. All are of categories that the shipped weights were not trained on.
+`tools/make_held_out.py` made the file. Each shape has {points} points, sampled uniformly by area,
+with the normals of their faces, centered and scaled into the unit sphere. Coordinates are stored as
+int16 (times 32767), normals as int8 (times 127). The shipped weights were not trained on any of
+these categories.
 
 | shape | category | author |
 |---|---|---|
@@ -71,7 +73,7 @@ def main() -> None:
                 path = f"{STEM}/{piece.identifier}"
                 category = category_of("furniture", f"{path}|{piece.name}|{piece.category}")
                 if category not in UNSEEN:
-                    raise SystemExit(f"{path} is of {category}, which is no unseen category")
+                    raise SystemExit(f"{path} is of {category}, which is not an unseen category")
                 mesh = opened.mesh(piece)
                 shapes.append(make_shape(mesh, f"sweethome3d:{path}", POINTS, least_faces=20))
                 categories.append(category)

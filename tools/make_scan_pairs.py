@@ -1,10 +1,10 @@
-"""Writes the pairs that the weights `scan` were validated on, as one file of pairs.
+"""Writes the validation pairs of the weights `scan` as one HDF5 file of pairs.
 
     python -m tools.make_scan_pairs --out scan_val.h5 [--config configs/scans.py]
     cfr calibrate scan --data scan_val.h5 --out scan.safetensors
 
-They are the validation part of the config: frames of the drive and pairs of depth images, whole and
-without normals, as a user has them.
+The config's validation part names them: LiDAR frames and pairs of depth images. The clouds are
+whole and have no normals, like those of users.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def main() -> None:
     given = runpy.run_path(args.config)["get_config"]().data.validation
     with tempfile.TemporaryDirectory() as cache, h5py.File(args.out, "w") as file:
         for number, source in enumerate(open_mixture(given, Path(cache), "validation").sources):
-            assert isinstance(source, SceneSource), "scans, and no shapes"
+            assert isinstance(source, SceneSource), "wanted scans, not shapes"
             for row in range(len(source)):
                 pair = source.read(row)
                 group = file.create_group(f"{number}_{row:03d}")

@@ -1,9 +1,10 @@
-"""Measures shipped weights on the shapes that ship, and writes that into their card.
+"""Measures shipped weights on the shipped shapes, and writes the results into their card.
 
     python tools/model_card.py object
 
-`cfr reproduce` holds later measurements against it. The card's other parts (what the weights are,
-their data, the scores of `evaluate.py`) are written by hand, and stay; of new weights, check them.
+`cfr reproduce` compares later measurements with them. The other parts of the card (what the weights
+are, their data, the scores of `evaluate.py`) are written by hand and kept. For new weights, check
+them.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from cfr_jax.weights.files import load_params
 def main() -> None:
     """Updates `cfr_jax/weights/shipped/NAME.json`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("name", help="of the weights and their card")
+    parser.add_argument("name", help="name of the weights and their card")
     path = cards.FOLDER / f"{parser.parse_args().name}.json"
     card = json.loads(path.read_text("utf-8"))
     sha256 = cards.file_facts(path.with_suffix(".safetensors"))["sha256"]
     if card["sha256"] != sha256:
-        print(f"other weights than before: check `about`, `data` and `measured` in {path}")
+        print(f"the weights have changed: check `about`, `data` and `measured` in {path}")
     with Progress(total=reproduction.PAIRS, desc="registering", unit=" pairs") as bar:
         scores = reproduction.measure(load_params(card["name"]), bar.update)
     card["sha256"] = sha256

@@ -1,4 +1,4 @@
-"""Plans of one size, solved together: each target encoded once, the pairs by `vmap`."""
+"""Solves plans of one size together: encodes each target once and maps over the pairs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _KEPT = 32  # encoded targets, about 2 MB each
 
 
 class Device:
-    """What runs on the accelerator, with the targets it has encoded lately."""
+    """Runs programs on the accelerator, and remembers the targets that it encoded last."""
 
     def __init__(self, params: Params, refine: Refinement | None, second_look: bool, size: int):
         self._params, self._refine = params, refine
@@ -41,8 +41,10 @@ class Device:
         self._encoded = Memo(_KEPT)
 
     def solve(self, plans: Sequence[Plan]) -> list[Alignment]:
-        """Answers of at most `size` plans of one `signature`; a short batch repeats its last plan,
-        so that it needs no program of its own."""
+        """The answers to at most `size` plans with the same `signature`.
+
+        A short batch repeats its last plan, so that it needs no program of its own.
+        """
         began = time.perf_counter()
         filled = [*plans, *[plans[-1]] * (self.size - len(plans))]
         targets, waited = zip(*(self._encode(plan.target) for plan in filled), strict=True)
@@ -64,7 +66,10 @@ class Device:
         ]
 
     def _answer(self, plan: Plan, found: Found, seconds: dict[str, float]) -> Alignment:
-        """After a second look where there is doubt; those pairs are few, and looked at singly."""
+        """The answer, after a second look if it is in doubt.
+
+        Such pairs are few, so they are solved one by one.
+        """
         case = Case(self._params, plan, found, seconds=dict(seconds))
         if self._second_look:
             began = time.perf_counter()
@@ -73,7 +78,7 @@ class Device:
         return answer(case)
 
     def _encode(self, target: UnitCloud) -> tuple[Encoded, float]:
-        """The features of a target, and how long their program took to compile."""
+        """The features of a target, and the seconds it took to compile their program."""
         compiling = 0.0
 
         def make() -> Encoded:
@@ -88,7 +93,7 @@ class Device:
 
 
 def signature(plan: Plan) -> Signature:
-    """Equal for plans that one compiled program can solve."""
+    """A key that is equal for plans that one compiled program can solve."""
     return tuple(
         (cloud.points.shape, cloud.neighbors.shape, cloud.normals is None)
         for cloud in (plan.source, plan.target)
@@ -97,7 +102,7 @@ def signature(plan: Plan) -> Signature:
 
 @jax.jit
 def encode_target(params: Params, target: solving.DeviceCloud) -> Encoded:
-    """The target's side of `solving.solve`, for a cloud as `solving.on_device` hands it over."""
+    """The target's side of `solving.solve`, for a cloud that `solving.on_device` returned."""
     return encode(params, target.prepared(), settings=SETTINGS)
 
 
@@ -109,7 +114,7 @@ def solve_many(
     *,
     refine: Refinement | None,
 ) -> Found:
-    """`solving.solve` of pairs of one size, all at once; every leaf has the pairs in front."""
+    """`solving.solve` for pairs of one size, all at once; each leaf has the pairs as first axis."""
 
     def solve(source: solving.DeviceCloud, target: Encoded) -> Found:
         return solving.solve(params, source.prepared(), target, refine=refine)
@@ -117,7 +122,7 @@ def solve_many(
     def stacked(clouds: Any) -> Any:
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
 
-    if len(sources) == 1:  # without an axis of length one, which slows a CPU down
+    if len(sources) == 1:  # without a batch axis: one of length one makes a CPU slower
         return stacked([solve(sources[0], targets[0])])
     return jax.vmap(solve)(stacked(sources), stacked(targets))
 

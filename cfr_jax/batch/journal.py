@@ -1,7 +1,7 @@
-"""What became of each pair, one JSON line each, so that no kill loses an answer.
+"""The results of all pairs, one JSON line each, so that a killed run loses no answer.
 
-A line is written in one go as soon as its pair is done. A line that a kill cut short is found when
-the file is opened again, and taken off. The first line says what the answers were made with.
+A line is written in one piece as soon as its pair is done. If a kill cut off the last line, it is
+removed when the file is opened again. The first line says what the answers were made with.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ class Journal:
     """An open journal; close it, or use it in a `with` statement."""
 
     def __init__(self, path: Path, made_with: dict[str, Any], retry: bool = False):
-        """Opens the journal at `path`, or begins it. With `retry`, pairs that failed count as not
-        done. Raises ValueError where another process has it open, where it was made with other
-        settings, and where it is no journal."""
+        """Opens the journal at `path`, or creates it.
+
+        With `retry`, pairs that failed count as not done. Raises ValueError if another process has
+        the file open, if it was made with other settings, or if it is not a journal.
+        """
         self.path = path
         self.done: dict[Key, dict[str, Any]] = {}
         header = {"format": FORMAT, "made_with": made_with}
@@ -46,17 +48,20 @@ class Journal:
         self.close()
 
     def close(self) -> None:
-        """Gives the file free for others."""
+        """Closes the file, so that other processes can open it."""
         with contextlib.suppress(OSError):
             os.close(self._file)
 
     def adopt(self, path: Path, made_with: dict[str, Any]) -> None:
-        """Takes what another journal of the same settings holds for done, too."""
+        """Also counts the pairs in another journal as done; it must have the same settings.
+
+        Raises ValueError if it has other settings or is not a journal.
+        """
         records = _records(path)
         header = next(records, {})
         if header.get("format") != FORMAT or "made_with" not in header:
             raise ValueError(
-                f"{path} is there and is no journal of `cfr batch`\n"
+                f"{path} exists, but is not a journal of `cfr batch`\n"
                 "move it, or choose another --out"
             )
         theirs = header["made_with"]
@@ -64,25 +69,26 @@ class Journal:
         if differing:
             name = differing[0]
             raise ValueError(
-                f"{path} was begun with {name} {theirs.get(name)!r}, not {made_with[name]!r}\n"
-                "give the same options to go on, remove it to start anew, or choose another --out"
+                f"{path} was started with {name} {theirs.get(name)!r}, not {made_with[name]!r}\n"
+                "give the same options to continue, remove it to start over, or choose another "
+                "--out"
             )
         for record in records:
-            # Of a pair that was tried again the last line counts.
+            # For a pair that was tried again, the last line counts.
             self.done[record["source"], record["target"], record["repeat"]] = record
 
     def _open(self, header: dict[str, Any]) -> None:
         data, start = self.path.read_bytes(), (json.dumps(header) + "\n").encode()
         whole = data.rfind(b"\n") + 1
         if whole or not start.startswith(data):
-            self.adopt(self.path, header["made_with"])  # before anything of it is changed
+            self.adopt(self.path, header["made_with"])  # before the file is changed at all
         os.ftruncate(self._file, whole)
         os.lseek(self._file, 0, os.SEEK_END)
         if not whole:
             self._append(header)
 
     def write(self, record: dict[str, Any]) -> None:
-        """Adds the record of a pair, and takes it for done once it is on its way to the disk."""
+        """Adds the record of a pair, and counts it as done once it is on its way to the disk."""
         self._append(record)
         self.done[record["source"], record["target"], record["repeat"]] = record
 
@@ -94,7 +100,7 @@ class Journal:
     def _lock(self) -> None:
         try:
             import fcntl
-        except ImportError:  # Windows: whoever starts two of one name there has to know better
+        except ImportError:  # Windows: nothing there keeps two runs from writing one file
             return
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -115,7 +121,7 @@ def _records(path: Path) -> Iterator[dict[str, Any]]:
             try:
                 record = json.loads(line)
                 if not isinstance(record, dict) or (number > 1 and "source" not in record):
-                    raise ValueError("it is no record of a pair")
+                    raise ValueError("it is not a record of a pair")
             except ValueError as error:
                 if number == 1:
                     return

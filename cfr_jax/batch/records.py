@@ -1,4 +1,4 @@
-"""What is written of a pair: a JSON record (`cli/schemas`), and the row of a table."""
+"""What is written about a pair: a JSON record (`cli/schemas`) and a row of the table."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLUMNS = ("source", "target", "status", *_FIGURES, *_CELLS, "remarks")
 
 
 def as_record(job: Job, outcome: Outcome) -> dict[str, Any]:
-    """Everything that is known of a pair; null for all figures of one that failed."""
+    """Everything that is known about a pair; if it failed, all figures are null."""
     found = outcome.alignment
     figures = dict.fromkeys(
         (*_FIGURES, "transform", "transforms", "refined", "neighbors", "used", "seconds")
@@ -42,7 +42,7 @@ def as_record(job: Job, outcome: Outcome) -> dict[str, Any]:
 
 
 def as_table(records: Iterable[dict[str, Any]]) -> str:
-    """CSV with a header; numbers keep all their digits, and failed pairs have the reason alone."""
+    """CSV with a header. Numbers keep all their digits; failed pairs have only the reason."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)

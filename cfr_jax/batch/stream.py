@@ -1,4 +1,4 @@
-"""`align_many`: any number of pairs, answered as `align` answers each."""
+"""`align_many`: `align` for any number of pairs."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from cfr_jax.io import PointCloud, as_point_cloud
 from cfr_jax.networks.record import Params
 from cfr_jax.refine import find
 
-# More pairs a call keep an accelerator busy, and a CPU's caches cold.
+# More pairs per call keep an accelerator busy, but do not fit in a CPU's caches.
 ON_CPU, ON_ACCELERATOR = 1, 16
-_TARGET_CLOUDS = 4  # whole clouds of files, which may be large
+_TARGET_CLOUDS = 4  # whole clouds from files, which may be large
 _TARGET_UNITS = 64
-_MOST_WAITING = 8  # batches' worth of pairs, before one is solved that is not full
+_MOST_WAITING = 8  # this many batches of pairs may wait before a batch is solved that is not full
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one pair."""
+    """The result for one pair: an alignment or an error."""
 
     index: int
     """Position of the pair in the input, from 0."""
@@ -92,7 +92,7 @@ def align_many(
 
 
 class _Planner:
-    """Pairs made ready, by many threads at once; targets that come again are not made again."""
+    """Prepares pairs, on many threads at once; repeated targets are prepared only once."""
 
     def __init__(self, budget: int, seed: int):
         self._budget, self._seed = budget, seed
@@ -111,7 +111,7 @@ class _Planner:
             if cloud is not target:
                 return make()[1]
             center, scale, motion = place
-            # the cloud is kept beside, so that no other gets its id
+            # the value keeps the cloud alive, so that no other cloud can get its id
             key = id(cloud), center.tobytes(), scale, motion.tobytes()
             return self._units.get(key, make)[1]
 
@@ -125,13 +125,13 @@ class _Planner:
         )
         if plan.starts is not None:
             raise ValueError(
-                "initial: got several starts, wanted one (4, 4); a search is for `align` alone"
+                "initial: got several starts, wanted one (4, 4); only `align` can search"
             )
         return plan
 
 
 def _done(plan: _Planner, pairs: Iterable[Any], device: Device, workers: int) -> Iterator[Outcome]:
-    """Outcomes as they come; the bucket that holds the oldest pair goes first where many wait."""
+    """Yields outcomes as they come; if many pairs wait, solves the batch with the oldest first."""
     waiting: dict[Signature, list[tuple[int, Plan]]] = {}
 
     def solve(key: Signature) -> Iterator[Outcome]:
@@ -142,7 +142,7 @@ def _done(plan: _Planner, pairs: Iterable[Any], device: Device, workers: int) ->
     for index, future in _ahead(plan, pairs, workers, 2 * device.size + workers):
         try:
             ready = future.result()
-        except Exception as error:  # whatever a file may hold, it is this pair's failure
+        except Exception as error:  # whatever is in a file, only this pair fails
             yield Outcome(index, None, _reason(error))
             continue
         key = signature(ready)
@@ -158,7 +158,7 @@ def _done(plan: _Planner, pairs: Iterable[Any], device: Device, workers: int) ->
 def _ahead(
     plan: Callable[[Any], Plan], pairs: Iterable[Any], workers: int, most: int
 ) -> Iterator[tuple[int, Future]]:
-    """Each pair's plan in the order of the pairs, up to `most` begun before they are asked for."""
+    """Yields the plan of each pair, in order; starts up to `most` of them ahead of time."""
     pool = ThreadPoolExecutor(workers, thread_name_prefix="cfr-read")
     begun: deque[tuple[int, Future]] = deque()
     try:
@@ -168,7 +168,7 @@ def _ahead(
                 yield begun.popleft()
         while begun:
             yield begun.popleft()
-    finally:  # also where nobody asks for more
+    finally:  # also if the caller stops early
         pool.shutdown(cancel_futures=True)
 
 

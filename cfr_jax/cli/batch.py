@@ -1,4 +1,4 @@
-"""`cfr batch PAIRS --out results.csv`: many pairs, and no answer lost on the way."""
+"""`cfr batch PAIRS --out results.csv`: registers many pairs, and loses no answer on the way."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def _kinds() -> str:
-    """The kinds of data that have pairs, or clouds to pair, a line each."""
+    """The kinds of data that have pairs, or clouds to pair, one line each."""
     return "\n".join(
         f"  {kind.name:11s} {kind.words}"
         for kind in kinds.known()
@@ -118,7 +118,7 @@ def _kinds() -> str:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Refuses what can be refused, does what is not done yet, writes the table."""
+    """Checks the arguments, registers the pairs that are not done yet, and writes the table."""
     outputs.check_output("--out", args.out, (".csv",))
     outputs.check_apart([args.pairs, *filter(None, [args.target])], [args.out])
 
@@ -162,7 +162,7 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             print(
                 f"cfr batch: stopped; {kept} keeps what is done\n"
-                "the same command goes on from there",
+                "run the same command again to continue",
                 file=sys.stderr,
             )
             raise
@@ -215,7 +215,7 @@ def _tell(records: list[dict[str, Any]], out: Path, kept: Path, strict: bool) ->
     if records and len(failed) == len(records):
         raise ValueError(
             f"none of the {len(records)} pairs could be registered: {failed[0]['error']}\n"
-            f"mend the files and add --retry-failed; every reason is in {out}"
+            f"fix the files and add --retry-failed; every reason is in {out}"
         )
     return UNTRUSTED if strict and trusted < len(records) else 0
 
@@ -238,7 +238,8 @@ def _shard(wish: str | None) -> Shard | None:
             jax.distributed.initialize()
     except (ValueError, RuntimeError) as error:
         raise ValueError(
-            "--shard auto: no cluster tells this process its number; give --shard I/N instead\n"
+            "--shard auto: found no cluster that gives this process a number; give --shard I/N "
+            "instead\n"
             f"({str(error).splitlines()[0]})"
         ) from None
     return process_shard()

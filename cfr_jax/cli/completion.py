@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _complete_files(parser: argparse.ArgumentParser, file: Any) -> None:
-    """Arguments that are paths are completed as such, in every command."""
+    """Lets arguments that are paths complete to file names, in every command."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for command in action.choices.values():

@@ -1,4 +1,4 @@
-"""`cfr convert`: the authors' PyTorch weights, of CFR or RPM-Net, into ours."""
+"""`cfr convert`: converts the authors' PyTorch weights of CFR or RPM-Net into ours."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Converts, and notes in the file what it was made from."""
+    """Converts a checkpoint; notes in the new file say what it was made from."""
     outputs.check_output("--out", args.out, (".safetensors",))
     outputs.check_apart([args.checkpoint], [args.out])
 

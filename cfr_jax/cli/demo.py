@@ -41,7 +41,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Registers the pair, prints how well, draws it."""
+    """Registers the pair, prints the quality of the result, and draws it."""
     page, picture = args.out / "demo.html", args.out / "demo.png"
     args.out.mkdir(parents=True, exist_ok=True)
     for path in (page, picture):
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"{name:<11} {text}")
     scene = report.as_scene(result, facts=errors)
     viewer.write_page(page, scene)
-    print(f"\nwrote       {page} (open it in a browser, and turn it)")
+    print(f"\nwrote       {page} (open it in a browser and rotate it)")
     if outputs.can_draw():
         viewer.write_picture(picture, scene)
         print(f"wrote       {picture}")

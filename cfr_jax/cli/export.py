@@ -1,4 +1,4 @@
-"""`cfr export`: the network as one StableHLO program, for hosts without this package."""
+"""`cfr export`: writes the network as one StableHLO program, for hosts without this package."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`cfr models`: the weights that ship, what they were made of, and how well they do."""
+"""`cfr models`: lists the shipped weights, what they were trained on, and how good they are."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def scores_in_words(scores: dict[str, float]) -> str:
-    """Mean and median rotation error, and the shares of pairs that were solved."""
+    """The scores in words: mean and median rotation error, and the shares of solved pairs."""
     recalls = []
     for name, share in scores.items():
         if name.startswith("recall_"):

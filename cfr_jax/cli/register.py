@@ -1,4 +1,4 @@
-"""`cfr register SOURCE TARGET`: the motion from one file onto another."""
+"""`cfr register SOURCE TARGET`: finds the motion that lays one file on another."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def _files() -> str:
-    """The formats that are read, a line of each sort, wrapped."""
+    """The formats that can be read, as wrapped lines."""
     bare = [form for form in formats.known() if form.holds == "surface"]
     either = [form for form in formats.known() if form.holds == "either"]
     surfaces = f"{formats.in_words(bare)}, and {formats.in_words(either)} with faces: points are"
@@ -175,7 +175,7 @@ def _files() -> str:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Reads, registers, writes; whatever can be refused is refused before JAX is imported."""
+    """Reads, registers and writes; what can be checked is checked before JAX is imported."""
     to_stdout = args.json == Path("-")
     _check_outputs(args, to_stdout)
 

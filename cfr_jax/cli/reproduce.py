@@ -1,4 +1,4 @@
-"""`cfr reproduce NAME`: measures shipped weights again, on shapes that ship, too."""
+"""`cfr reproduce NAME`: measures shipped weights again, on shapes that also ship."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measures, and holds the scores against those of the card."""
+    """Measures the weights, and compares the scores with those on their card."""
     to_stdout = args.json == Path("-")
     told = sys.stderr if to_stdout else sys.stdout
     if args.json is not None and not to_stdout:

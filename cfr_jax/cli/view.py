@@ -1,4 +1,4 @@
-"""`cfr view RESULT.json`: the picture of a registration that was saved before."""
+"""`cfr view RESULT.json`: draws a registration that was saved before."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> int:
     """Reads the result and its clouds, and draws them."""
     wanted = args.out or [args.result.with_suffix(".html")]
     if not args.out and wanted[0].exists():
-        # perhaps the page of `cfr register --view`, which holds more
-        raise ValueError(f"{wanted[0]} is there already: name what to write with --out")
+        # perhaps the page of `cfr register --view`, which shows more
+        raise ValueError(f"{wanted[0]} already exists: name the file to write with --out")
     for path in wanted:
         outputs.check_output("--out", path, _SUFFIXES)
         outputs.check_library("--out", path)

@@ -1,8 +1,7 @@
-"""What makes training pairs harder than their shapes: motion, orientation, scale, crop, density,
-noise, outliers.
+"""Augmentations of training pairs: motion, orientation, scale, crop, density, noise, outliers.
 
-Every draw comes from the generator that is handed in. Lengths are in the unit sphere, where the
-network works.
+Every random number comes from the generator that is passed in. Lengths refer to the unit sphere, in
+which the network works.
 """
 
 from __future__ import annotations
@@ -28,49 +27,53 @@ _SHARES = (
     "estimated_normals",
 )
 _RANGES = ("keep", "scale", "density", "outliers", "noise", "sensor_scale")
-SENSOR_AWAY = (2.0, 4.0)  # of a sensor from the middle of what it sees
+SENSOR_AWAY = (2.0, 4.0)  # distance of a simulated sensor from the center of the cloud
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """How training pairs are drawn. Pairs of numbers are ranges, from which each cloud (or, for
-    `scale`, each pair) draws evenly; shares are of all pairs."""
+    """How training pairs are drawn.
+
+    A pair of numbers is a range, from which each cloud draws uniformly (for `scale`: each pair).
+    Shares are shares of all pairs.
+    """
 
     points: int = 717
     neighbors: int = 32
     radius: float = 0.3
     keep: tuple[float, float] = (0.7, 0.7)
-    """Share of the shape left by the crop of each cloud."""
+    """Share of the shape that the crop of each cloud keeps."""
     angle: float = 45.0
     """Degrees; each Euler angle of the motion is drawn from [0, angle]."""
     translation: float = 0.5
     """Each coordinate of the motion is drawn from [-translation, translation]."""
     both_ways: float = 0.0
-    """Share whose Euler angles are drawn from [-angle, angle] instead: the protocol's pairs are
-    turned one way only, those of users any way."""
+    """Share whose Euler angles are drawn from [-angle, angle] instead. The protocol turns its pairs
+    in one direction only, but users' pairs may be turned either way."""
     near: float = 0.0
-    """Share whose motion is smaller, by a factor drawn from [0, 1]: such is what a first cascade
-    leaves to a second."""
+    """Share whose motion is scaled down by a factor drawn from [0, 1]. A first cascade leaves such
+    small motions to a second one."""
     centered: float = 0.0
-    """Share whose clouds lie about their own centroids, as `align` hands them over; the others
-    about the middle of the shape, which a crop does not show."""
+    """Share whose clouds are centered at their own centroids, as in `align`. The others are
+    centered at the middle of the shape, which a crop does not reveal."""
     any_orientation: float = 0.0
-    """Share whose shape is first turned at random: CAD models stand upright, scans may not."""
+    """Share whose shape is first rotated at random. CAD models stand upright, but scans may not."""
     scale: tuple[float, float] = (1.0, 1.0)
+    """Factor by which both clouds are scaled."""
     uneven: float = 0.0
-    """Share whose clouds are denser on one side, each on a side of its own."""
+    """Share whose clouds are denser on one side, a different side for each cloud."""
     density: tuple[float, float] = (3.0, 10.0)
-    """How many times denser the densest side then is than the sparsest."""
+    """How many times denser the densest side of such a cloud is than its sparsest side."""
     outliers: tuple[float, float] = (0.0, 0.0)
-    """Share of the points that lie anywhere in the ball around the cloud."""
+    """Share of points that are replaced by points anywhere in the ball around the cloud."""
     noise: tuple[float, float] = (NOISE_SCALE, NOISE_SCALE)
-    """Standard deviation per axis, cut off at five times that."""
+    """Standard deviation per axis. Noise is clipped at five standard deviations."""
     sensor_noise: float = 0.0
-    """Share whose noise is that of a depth sensor: along the ray, growing with distance squared."""
+    """Share with the noise of a depth sensor: along the ray, growing with the squared distance."""
     sensor_scale: tuple[float, float] = (0.005, 0.02)
-    """Its standard deviation at the middle of the cloud."""
+    """Standard deviation of the sensor noise at the center of the cloud."""
     estimated_normals: float = 0.0
-    """Share whose normals are estimated from the noisy points, as most users' are."""
+    """Share whose normals are estimated from the noisy points, as for most users' clouds."""
 
     def __post_init__(self) -> None:
         for name in _SHARES:
@@ -80,7 +83,7 @@ class Sampling:
             given = getattr(self, name)
             if not (np.shape(given) == (2,) and 0 <= given[0] <= given[1]):
                 raise ValueError(
-                    f"{name}: got {given}, wanted two numbers from 0 on, the lower one first"
+                    f"{name}: got {given}, wanted two numbers >= 0, the lower one first"
                 )
         if not (self.angle >= 0 and self.translation >= 0):
             raise ValueError(
@@ -90,22 +93,24 @@ class Sampling:
             raise ValueError(f"points: got {self.points}, wanted at least 2")
         if not (self.keep[0] > 0 and self.keep[1] <= 1 and self.outliers[1] < 1):
             raise ValueError(
-                f"keep, outliers: got {self.keep} and {self.outliers}, wanted shares of the points"
+                f"keep, outliers: got {self.keep} and {self.outliers}, wanted shares of the "
+                "points: keep above 0 and at most 1, outliers below 1"
             )
         if not (self.scale[0] > 0 and self.density[0] >= 1):
             raise ValueError(
-                f"scale, density: got {self.scale} and {self.density}, wanted more than 0 and "
-                "at least 1"
+                f"scale, density: got {self.scale} and {self.density}, wanted a scale above 0 "
+                "and a density of at least 1"
             )
         if not 1 <= self.neighbors < self.points:
             raise ValueError(
-                f"neighbors: got {self.neighbors} of {self.points} points, wanted fewer than those"
+                f"neighbors: got {self.neighbors}, wanted at least 1 and fewer than the "
+                f"{self.points} points"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One cloud of a pair before it is made harder: unit size, `sampling.points` rows."""
+    """One cloud of a pair before augmentation: of unit size, with `sampling.points` rows."""
 
     points: Float32[np.ndarray, "n 3"]
     normals: Float32[np.ndarray, "n 3"] | None
@@ -114,16 +119,17 @@ class View:
 def choose_rows(
     points: Float[np.ndarray, "p 3"], sampling: Sampling, uneven: bool, rng: np.random.Generator
 ) -> Int[np.ndarray, " n"]:
-    """`sampling.points` rows of a cloud: at random, or thinning out along a random direction.
+    """`sampling.points` random rows of a cloud.
 
-    None twice, unless there are too few.
+    If `uneven`, the cloud gets sparser along a random direction. No row is chosen twice, unless
+    there are too few.
     """
     if not uneven:
         return resample(len(points), sampling.points, rng)
     height = points @ _direction(rng)
     height = (height - height.min()) / max(float(np.ptp(height)), 1e-12)
     log_weight = np.log(rng.uniform(*sampling.density)) * height
-    # the largest of weights perturbed by Gumbel noise are a weighted draw without replacement
+    # Gumbel noise on the log weights: the largest sums are a weighted draw without replacement.
     order = np.argsort(-(log_weight + rng.gumbel(size=len(points))))
     chosen = order[: sampling.points]
     return np.concatenate([chosen, chosen[resample(len(chosen), sampling.points, rng)]])[
@@ -138,10 +144,10 @@ def finish_pair(
     sampling: Sampling,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """A training pair as arrays: both clouds with their neighbors, and the true motion.
+    """A training pair as a dict of arrays: both clouds with their neighbors, and the true motion.
 
-    `truth` maps the views onto each other, source onto target; what comes back as "transform" does
-    so for the clouds as they come back, which are turned, scaled, moved and noisy.
+    `truth` maps the source view onto the target view. The returned "transform" maps the returned
+    source onto the returned target, after they were rotated, scaled, moved and made noisy.
     """
     turn = np.eye(3)
     if rng.random() < sampling.any_orientation:
@@ -187,7 +193,7 @@ def _motion(sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "
 def add_noise(
     points: Float[np.ndarray, "n 3"], sampling: Sampling, rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
-    """The same on every axis, as the published protocols have it."""
+    """Adds Gaussian noise of equal scale on every axis, as in the published protocols."""
     scale = rng.uniform(*sampling.noise)
     most = scale * NOISE_CLIP / NOISE_SCALE
     return points + np.clip(rng.normal(0.0, scale, points.shape), -most, most)
@@ -196,8 +202,11 @@ def add_noise(
 def add_sensor_noise(
     points: Float[np.ndarray, "n 3"], sampling: Sampling, rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
-    """Along the rays of a depth sensor somewhere around the cloud, which measures disparity: its
-    error grows with the square of the distance (Khoshelham & Elberink, 2012)."""
+    """Adds noise along the rays of a depth sensor at a random place around the cloud.
+
+    Such a sensor measures disparity, so its error grows with the square of the distance
+    (Khoshelham & Elberink, 2012).
+    """
     middle = points.mean(axis=0)
     away = rng.uniform(*SENSOR_AWAY)
     ray = points - (middle + away * _direction(rng))
@@ -213,8 +222,8 @@ def add_outliers(
     sampling: Sampling,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Some points replaced by others, evenly spread in the ball that holds the cloud, with normals
-    of any direction."""
+    """Replaces some points by points spread evenly in the ball around the cloud, with random
+    normals."""
     count = int(rng.uniform(*sampling.outliers) * len(points))
     if not count:
         return points, normals

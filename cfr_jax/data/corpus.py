@@ -1,13 +1,13 @@
-"""Corpora of shapes: equal-sized point clouds with normals, read from HDF5 files.
+"""Corpora of shapes: point clouds of equal size with normals, read from HDF5 files.
 
 The layout is that of `modelnet40_ply_hdf5_2048` (Qi et al., 2017), one row per shape:
 
     data    (S, P, 3)  float, x y z
-    normal  (S, P, 3)  float; or int8 with an attribute `scale`
-    label   (S,) or (S, 1)  integers, line numbers in `shape_names.txt` beside the file
+    normal  (S, P, 3)  float, or int8 with an attribute `scale`
+    label   (S,) or (S, 1)  integers, line numbers (from 0) in `shape_names.txt` beside the file
     names   (S,)  strings, optional
 
-Several files make one corpus; their categories are matched by name.
+Several files can form one corpus. Their categories are matched by name.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from jaxtyping import Float, Float32, Int
 
 LAYOUT = (
     "A corpus is an HDF5 file with `data` (S, P, 3), `normal` (S, P, 3) and `label` (S,), "
-    "and a `shape_names.txt` beside it with one category a line."
+    "and a `shape_names.txt` beside it with one category per line."
 )
 
 
@@ -30,8 +30,8 @@ LAYOUT = (
 class Corpus:
     """S shapes of P points each.
 
-    Normals have unit length, or are zero where the file has none. `categories[labels[s]]` is the
-    category of shape `s`, and `names[s]` says where it came from.
+    Normals have unit length, or are zero where the file's normal is zero. `categories[labels[s]]`
+    is the category of shape `s`, and `names[s]` says where it came from.
     """
 
     points: Float32[np.ndarray, "s p 3"]
@@ -50,7 +50,7 @@ class Corpus:
         return self.points[index], self.normals[index]
 
     def take(self, rows: slice | Sequence[int] | np.ndarray) -> Corpus:
-        """The corpus of some of the shapes; `rows` is a slice, indices, or a mask."""
+        """A corpus with some of the shapes. `rows` is a slice, indices, or a mask."""
         kept = np.arange(len(self))[rows]
         return Corpus(
             points=self.points[kept],
@@ -61,26 +61,33 @@ class Corpus:
         )
 
     def of_categories(self, categories: Iterable[str]) -> Corpus:
-        """The shapes of these categories, in their order here; unknown names are a ValueError."""
+        """The shapes of these categories, in their present order.
+
+        Raises ValueError for a category that the corpus does not have.
+        """
         wanted = list(categories)
         unknown = sorted(set(wanted) - set(self.categories))
         if unknown:
-            raise ValueError(f"categories {unknown} are not in the corpus: {self.categories}")
+            raise ValueError(
+                f"categories: {unknown} are not in the corpus, wanted some of {self.categories}"
+            )
         return self.take(np.isin(self.labels, [self.categories.index(c) for c in wanted]))
 
 
 def read_corpus(paths: str | Path | Iterable[str | Path]) -> Corpus:
-    """Reads a corpus from a file, from several files in the order given, or from a folder.
+    """Reads a corpus from a file, from several files in the given order, or from a folder.
 
-    Of a folder, all `.h5` and `.hdf5` files are read in the order of their names. Normals are made
-    unit length. A file without names gives `file:row`; a label without a category is its number.
-    Raises ValueError where a file is missing, is not of this layout, or holds numbers that are not
-    finite.
+    In a folder, all `.h5` and `.hdf5` files are read in the order of their names. Normals are
+    scaled to unit length. If a file has no names, they become `file:row`. If there is no
+    `shape_names.txt`, the categories are named by their numbers. Raises ValueError if a file is
+    missing, does not have this layout, or holds numbers that are not finite.
     """
     parts = [_read_file(path) for path in _files(paths)]
     sizes = {part.points.shape[1] for part in parts}
     if len(sizes) > 1:
-        raise ValueError(f"files of one corpus hold equally many points, these hold {sizes}")
+        raise ValueError(
+            f"paths: these files have shapes of {sizes} points, wanted the same number in all files"
+        )
     categories = tuple(dict.fromkeys(c for part in parts for c in part.categories))
     renumbered = [
         np.array([categories.index(c) for c in part.categories], np.int64)[part.labels]
@@ -99,7 +106,7 @@ def _files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     if not isinstance(paths, (str, Path)):
         files = [Path(path) for path in paths]
         if not files:
-            raise ValueError(f"paths is empty. {LAYOUT}")
+            raise ValueError(f"paths: got no path, wanted at least one. {LAYOUT}")
         return files
     path = Path(paths)
     if not path.is_dir():
@@ -120,7 +127,7 @@ def _read_file(path: Path) -> Corpus:
     with file:
         missing = [key for key in ("data", "normal", "label") if key not in file]
         if missing:
-            raise ValueError(f"{path} lacks {missing}, it holds {sorted(file)}. {LAYOUT}")
+            raise ValueError(f"{path} lacks {missing}, and holds only {sorted(file)}. {LAYOUT}")
         points = file["data"][()].astype(np.float32)
         scale = np.float32(file["normal"].attrs.get("scale", 1.0))
         normals = file["normal"][()].astype(np.float32) * scale
@@ -128,9 +135,11 @@ def _read_file(path: Path) -> Corpus:
         names = file["names"].asstr()[()] if "names" in file else None
 
     if points.ndim != 3 or points.shape[-1] != 3 or 0 in points.shape:
-        raise ValueError(f"{path}: `data` is {points.shape}, wanted (S, P, 3)")
+        raise ValueError(f"{path}: `data` has shape {points.shape}, wanted (S, P, 3)")
     if normals.shape != points.shape:
-        raise ValueError(f"{path}: `normal` is {normals.shape}, but `data` is {points.shape}")
+        raise ValueError(
+            f"{path}: `normal` has shape {normals.shape}, wanted that of `data`, {points.shape}"
+        )
     if len(labels) != len(points):
         raise ValueError(f"{path}: {len(labels)} labels for {len(points)} shapes")
     if names is not None and len(names) != len(points):
@@ -165,6 +174,7 @@ def _categories(path: Path, labels: Int[np.ndarray, " s"]) -> tuple[str, ...]:
     categories = tuple(line.strip() for line in listed.read_text().splitlines() if line.strip())
     if labels.max() >= len(categories):
         raise ValueError(
-            f"{path}: label {labels.max()} has no line in {listed}, which lists {len(categories)}"
+            f"{path}: label {labels.max()} has no line in {listed}, which lists {len(categories)} "
+            "categories"
         )
     return categories

@@ -1,12 +1,13 @@
 """Training pairs of shapes, drawn on the device that trains on them.
 
-What `sources.ShapeSource` and `augment` do on the host, with the same distributions (not the same
-random numbers), as one program: nothing is copied from the host but the numbers of the shapes. A
-pair is a function of its key alone, and the key of (seed, position in the stream), so a resumed
-run, and any number of devices, draw the same pairs.
+One program does what `sources.ShapeSource` and `augment` do on the host, with the same
+distributions (not the same random numbers). Only the indices of the shapes are copied from the
+host. A pair depends only on its shape and its key, and the key depends only on the seed and the
+position in the stream. So a resumed run draws the same pairs, and so does any number of devices.
 
-Arrays have fixed sizes here. So a crop is a score of minus infinity, and a draw of n rows without
-replacement takes the n highest of random scores. Shares and ranges that are zero cost nothing.
+Arrays have fixed sizes here. So cropped points get a score of minus infinity, and a draw of n rows
+without replacement takes the n highest random scores. Most options that are set to zero cost
+nothing.
 """
 
 from __future__ import annotations
@@ -25,25 +26,27 @@ from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.protocol import NOISE_CLIP, NOISE_SCALE
 from cfr_jax.geometry import neighbors, rigid
 
-_MOST = NOISE_CLIP / NOISE_SCALE  # noise is cut off at so many standard deviations
-_BYTE = 127  # of a normal's coordinate 1
+_MOST = NOISE_CLIP / NOISE_SCALE  # standard deviations at which noise is clipped
+_BYTE = 127  # int8 value of a normal's coordinate 1
 
 
 @struct.dataclass
 class Shapes:
-    """A corpus in as few bytes as its precision needs: 9 of a point with its normal."""
+    """A corpus in as few bytes as its precision needs: 9 for a point with its normal."""
 
     points: Float16[Array, "s p 3"] | Float16[np.ndarray, "s p 3"]
     normals: Int8[Array, "s p 3"] | Int8[np.ndarray, "s p 3"]
-    """In 127ths; zero where a shape has none."""
+    """In units of 1/127; zero where a shape has no normal."""
 
     @classmethod
     def of(cls, corpus: Corpus) -> Shapes:
-        """The shapes of a corpus, still in host memory. Rounds coordinates to 2^-12 within the unit
-        sphere, and normals by 0.3 degrees. Raises ValueError where a coordinate is too large.
+        """The shapes of a corpus, still in host memory.
+
+        Rounding changes coordinates in the unit sphere by at most 2^-12, and normals by 0.3
+        degrees. Raises ValueError if a coordinate is too large for float16.
         """
         most = float(np.abs(corpus.points).max())
-        if most > float(np.finfo(np.float16).max):  # the comparison would be in float16
+        if most > float(np.finfo(np.float16).max):  # float(), or it would compare in float16
             raise ValueError(
                 f"corpus: got a coordinate of {most:g}, wanted shapes in the unit sphere"
             )
@@ -52,7 +55,7 @@ class Shapes:
 
 
 class _Draw(NamedTuple):
-    """What is decided for a pair as a whole."""
+    """The random choices that both clouds of a pair share."""
 
     turn: Float[Array, "3 3"]
     motion: Float[Array, "4 4"]
@@ -70,8 +73,11 @@ def draw_pairs(
     positions: UInt32[Array, " b"],
     sampling: Sampling,
 ) -> dict[str, Array]:
-    """A batch as `loader.batch_at` makes it: a pair of shape `items[i]` for each place
-    `positions[i]` of the stream, arrays (b, ...). `sampling` is static."""
+    """A batch in the format of `loader.batch_at`, with arrays (b, ...).
+
+    Pair i is made from shape `items[i]` for position `positions[i]` of the stream. `sampling` is
+    static.
+    """
     key = random.key(seed)
 
     def one(item: Array, position: Array) -> dict[str, Array]:
@@ -88,9 +94,11 @@ def draw_pair(
     key: Key[Array, ""],
     sampling: Sampling,
 ) -> dict[str, Array]:
-    """A pair of one shape, as `augment.finish_pair` gives it: both clouds (n, 3) float32 with
-    normals and neighbors (n, k), `transform` (4, 4), source onto target, and whether normals are to
-    be estimated."""
+    """A pair made from one shape, in the format of `augment.finish_pair`.
+
+    It has both clouds (n, 3) float32, each with normals and neighbors (n, k), "transform" (4, 4),
+    which maps source onto target, and "estimate_normals".
+    """
     points, normals = points.astype(jnp.float32), normals.astype(jnp.float32)
     length = jnp.sqrt(jnp.sum(normals * normals, axis=1, keepdims=True))
     normals = normals / jnp.maximum(length, 1)
@@ -100,7 +108,7 @@ def draw_pair(
     def cloud(key: Array, placed: Array) -> tuple[Array, Array, Array]:
         return _cloud(points, normals, placed, drawn, key, sampling)
 
-    # both clouds in one go: half as many kernels
+    # both clouds at once, which takes half as many kernels
     placed = jnp.stack([drawn.motion, jnp.eye(4)])
     x, n, middle = jax.vmap(cloud)(random.split(of_sides, 2), placed)
     found = jax.vmap(lambda x: neighbors.nearest(x, sampling.neighbors, radius=sampling.radius))(x)
@@ -162,7 +170,7 @@ def _cloud(
     key: Key[Array, ""],
     sampling: Sampling,
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, " 3"]]:
-    """Points and normals of one side, and what was taken off to center it."""
+    """Points and normals of one side, and the offset that was subtracted to center it."""
     of_rows, of_noise, of_outliers = random.split(key, 3)
     rows = _rows(points, drawn.uneven, of_rows, sampling)
     rotation = rigid.from_parts(drawn.turn, jnp.zeros(3))
@@ -182,8 +190,10 @@ def _cloud(
 def _rows(
     points: Float[Array, "p 3"], uneven: Bool[Array, ""], key: Key[Array, ""], sampling: Sampling
 ) -> Int32[Array, " n"]:
-    """Rows of one cloud: a crop, and of what it leaves `sampling.points`, as `augment.choose_rows`
-    draws them. Where it leaves too few, all of them, and some again."""
+    """Rows of one cloud: a crop, then `sampling.points` of its rows, as in `augment.choose_rows`.
+
+    If the crop leaves too few rows, all of them are used and some are repeated.
+    """
     of_keep, of_plane, of_side, of_scores, of_more = random.split(key, 5)
     count, n = points.shape[0], sampling.points
     keep = _between(of_keep, sampling.keep)
@@ -197,13 +207,13 @@ def _rows(
         times = _between(of_density, sampling.density)
         weight = jnp.log(times) * (height - low) / jnp.maximum(high - low, 1e-12)
         score = score + jnp.where(uneven, weight, 0)
-    # the largest of weights perturbed by Gumbel noise are a weighted draw without replacement
+    # Gumbel noise on the log weights: the largest sums are a weighted draw without replacement.
     order = jnp.argsort(jnp.where(kept, score, -jnp.inf), descending=True)
     left = jnp.maximum(jnp.sum(kept), 1)
     place = jnp.arange(n)
     again = random.randint(of_more, (n,), 0, left)
     if sampling.uneven:
-        # none comes a third time before all came twice
+        # no row is used a third time before all are used twice
         chance = jnp.where(place < left, random.uniform(of_side, (n,)), jnp.inf)
         turns = jnp.argsort(chance)[jnp.clip(place - left, 0, n - 1)]
         again = jnp.where(uneven & (place < 2 * left), turns, again)
@@ -213,8 +223,10 @@ def _rows(
 def _crop(
     points: Float[Array, "p 3"], keep: Float[Array, ""], key: Key[Array, ""]
 ) -> Bool[Array, " p"]:
-    """Which points lie beyond a plane with a random normal that leaves a share of `keep`, as
-    `protocol.crop` has it."""
+    """Which points a crop keeps: those beyond a plane with a random normal, as in `protocol.crop`.
+
+    `keep` is the share of points that are kept.
+    """
     count = points.shape[0]
     height = _heights(points - jnp.mean(points, axis=0), key)
     place = (1 - keep) * (count - 1)
@@ -264,7 +276,7 @@ def _between(key: Key[Array, ""], limits: tuple[float, float]) -> Float[Array, "
 
 
 def _heights(points: Float[Array, "p 3"], key: Key[Array, ""]) -> Float[Array, " p"]:
-    """Along a random direction; summed in float32, which a product on a GPU would not be."""
+    """Heights along a random direction, summed in float32, which a GPU's matrix product is not."""
     return jnp.sum(points * _directions(key, 1), axis=1)
 
 

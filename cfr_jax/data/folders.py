@@ -1,4 +1,4 @@
-"""What lies in a folder or an HDF5 file, by names and first bytes alone: nothing is read."""
+"""What a folder or an HDF5 file contains, judged from names and first bytes only."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 from cfr_jax.io.formats import Format, by_suffix
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
-_START = 4096  # bytes that tell whether a file has faces
-_PEEKED = 16  # files of a folder whose first bytes are read
+_START = 4096  # bytes that are enough to see whether a file has faces
+_PEEKED = 16  # files of a format in a folder whose first bytes are read
 
 
 def loose_files(folder: Path, formats: Iterable[Format]) -> list[Path]:
-    """Files of a folder and its folders, in the order a person counts: scan2 before scan10.
+    """Files in a folder and its subfolders, in natural order: scan2 before scan10.
 
-    Hidden ones, and formats whose files have to be named, are passed over.
+    Hidden files are skipped, and so are formats that are read only if a file is named explicitly.
     """
     suffixes = {suffix for suffix, form in by_suffix(formats).items() if form.loose}
     found = [
@@ -31,16 +31,16 @@ def loose_files(folder: Path, formats: Iterable[Format]) -> list[Path]:
 
 
 def natural(name: str) -> list[tuple[int, str]]:
-    """A key that sorts numbers within names by their value."""
+    """A sort key that orders numbers within names by value."""
     return [
         (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)
     ]
 
 
 def count_loose(folder: Path, formats: Iterable[Format], surfaces: bool) -> Counter[str]:
-    """How many files of each suffix hold surfaces, or else clouds.
+    """How many files of each suffix hold surfaces or, if not `surfaces`, clouds.
 
-    Those of a format that may be either are what their first bytes say.
+    If a format may hold either, the first bytes of the files decide.
     """
     if not folder.is_dir():
         return Counter()
@@ -54,19 +54,19 @@ def count_loose(folder: Path, formats: Iterable[Format], surfaces: bool) -> Coun
         else:
             open_questions.setdefault(form, []).append(path)
     for form, paths in open_questions.items():
-        # A folder's files of one format are taken to be alike: a few of them tell.
+        # A folder's files of one format are assumed to be alike, so a few of them are enough.
         if any(_has_faces(form, path) == surfaces for path in paths[:_PEEKED]):
             counts.update(path.suffix.lower() for path in paths)
     return counts
 
 
 def in_words(name: str, counts: Counter[str]) -> str | None:
-    """As "3 meshes (.off, .stl)"; None of nothing."""
+    """A phrase such as "3 meshes (.off, .stl)", or None if there are none."""
     return f"{counts.total()} {name} ({', '.join(sorted(counts))})" if counts else None
 
 
 def hdf5_members(path: Path) -> tuple[list[str], list[str]]:
-    """Names of what an HDF5 file holds, and which of them are groups; none of another file."""
+    """Names of all members of an HDF5 file, and of its groups; both empty for any other file."""
     import h5py
 
     if not path.is_file() or not h5py.is_hdf5(path):
@@ -79,7 +79,7 @@ def hdf5_members(path: Path) -> tuple[list[str], list[str]]:
 
 
 def _has_faces(form: Format, path: Path) -> bool:
-    assert form.has_faces is not None  # that is what makes it an open question
+    assert form.has_faces is not None  # only such formats are asked
     try:
         with open(path, "rb") as stream:
             return form.has_faces(stream.read(_START))

@@ -1,13 +1,15 @@
 """Pairs of LiDAR scans from the KITTI odometry benchmark (Geiger et al., 2012).
 
-The folder is laid out as the benchmark's downloads unpack:
+The folder has the layout of the benchmark's unpacked downloads:
 
     sequences/NN/velodyne/000000.bin ...  float32 x, y, z, reflectance; meters around the sensor
     sequences/NN/calib.txt                a line `Tr:` with the motion from LiDAR to camera
-    poses/NN.txt                          a line per frame: the motion from camera to first camera
+    poses/NN.txt                          one line per frame: the motion from its camera frame to
+                                          that of the first frame
 
-Pairs follow the published procedure: a frame and the first later one more than 10 m away, the
-recorded motion refined by point-to-plane ICP, and only pairs kept that the refinement confirms.
+Pairs follow the published procedure. A pair is a frame and the first later frame more than 10 m
+away. The recorded motion is refined by point-to-plane ICP, and only pairs that the refinement
+confirms are kept.
 """
 
 from __future__ import annotations
@@ -34,19 +36,19 @@ NORMAL_RADIUS = 3.0  # m
 ICP_THRESHOLD = 1.0  # m
 MIN_FITNESS = 0.65
 LAYOUT = (
-    "The folder holds sequences/NN/velodyne/*.bin, sequences/NN/calib.txt and poses/NN.txt; get "
-    "`velodyne laser data`, `calibration files` and `ground truth poses` of the odometry benchmark "
-    "at https://www.cvlibs.net/datasets/kitti/eval_odometry.php."
+    "The folder must hold sequences/NN/velodyne/*.bin, sequences/NN/calib.txt and poses/NN.txt. "
+    "Download `velodyne laser data`, `calibration files` and `ground truth poses` of the odometry "
+    "benchmark from https://www.cvlibs.net/datasets/kitti/eval_odometry.php."
 )
 
 
 @dataclass(frozen=True, eq=False)
 class ScanPairs:
-    """Pairs of frames of one sequence with their refined truth.
+    """Pairs of frames of one sequence, with refined true motions.
 
-    `frames[p]` is (source, target), the earlier frame being the source; `transforms[p]` maps source
-    onto target, each in the frame of its LiDAR; `fitness[p]` is the share of the source within
-    1 m of the target under it.
+    `frames[p]` is (source, target), where the source is the earlier frame. `transforms[p]` maps
+    source onto target, each in its own LiDAR frame. `fitness[p]` is the share of source points that
+    `transforms[p]` brings within 1 m of the target.
     """
 
     folder: Path
@@ -62,13 +64,13 @@ class ScanPairs:
 def scan_pair(
     scans: ScanPairs, index: int, points: int = 4000, angle: float = 45.0, translation: float = 15.0
 ) -> Pair:
-    """Pair `index`, its source moved at random, both clouds thinned to 0.3 m and then to `points`.
+    """Pair `index`, with a random motion applied to its source.
 
-    Always the same for the same index, as in `fixed_pair`. A cloud that has fewer points repeats
-    some.
+    Both clouds are thinned to voxels of 0.3 m and then to `points` points; a cloud with fewer
+    points repeats some. The same index always gives the same pair, as in `fixed_pair`.
     """
     if not 0 <= index < len(scans):
-        raise ValueError(f"index is {index}, wanted 0 to {len(scans) - 1}")
+        raise ValueError(f"index: got {index}, wanted 0 to {len(scans) - 1}")
     rng = np.random.RandomState(index)
     motion = random_motion(angle, translation, rng).astype(np.float64)
     clouds = []
@@ -97,11 +99,12 @@ def read_pairs(
     distance: float = 10.0,
     stride: int | None = None,
 ) -> ScanPairs:
-    """The pairs of a sequence. `cache` keeps the refinement, which takes a second for a full scan.
+    """The pairs of a sequence.
 
-    `cache` is an .npz file, written when it is not there and used when it was written for the same
-    sequence, poses and settings. `distance` and `stride` are those of `select_frames`. Raises
-    ValueError where the sequence is not there or not as it should be.
+    `cache` is an .npz file that keeps the refined motions, because refining takes a second per pair
+    of full scans. It is used if it was written for the same sequence, poses and settings, and
+    written otherwise. For `distance` and `stride` see `select_frames`. Raises ValueError if the
+    sequence is missing or malformed.
     """
     folder = Path(folder)
     poses = read_poses(folder, sequence)
@@ -121,13 +124,14 @@ def read_pairs(
 def select_frames(
     poses: Float[np.ndarray, "f 4 4"], distance: float = 10.0, stride: int | None = None
 ) -> Int[np.ndarray, "p 2"]:
-    """A frame and the first later one more than `distance` meters away, again and again.
+    """Pairs of a frame and the first later frame more than `distance` meters away.
 
-    As published, the next pair starts after the last one ended; with a `stride` it starts so many
-    frames after the last one started, which gives more pairs that share frames.
+    As published, the next pair starts with the frame after the end of the last pair. With a
+    `stride`, it starts that many frames after the start of the last pair, which gives more pairs
+    that share frames.
     """
     if stride is not None and stride < 1:
-        raise ValueError(f"stride is {stride}, wanted None or at least 1 frame")
+        raise ValueError(f"stride: got {stride}, wanted None or at least 1 frame")
     places = poses[:, :3, 3]
     pairs, start = [], 0
     while start < len(places):
@@ -140,9 +144,9 @@ def select_frames(
 
 
 def read_poses(folder: str | Path, sequence: str) -> Float[np.ndarray, "f 4 4"]:
-    """Per frame the motion from its LiDAR frame to that of the first frame."""
+    """For each frame, the motion from its LiDAR frame to that of the first frame."""
     folder = Path(folder)
-    rows = _numbers(folder / "poses" / f"{sequence}.txt", "12 numbers a line", str.split)
+    rows = _numbers(folder / "poses" / f"{sequence}.txt", "12 numbers per line", str.split)
     calibration = _numbers(
         folder / "sequences" / sequence / "calib.txt",
         "a line `Tr:` with 12 numbers",
@@ -155,7 +159,7 @@ def read_poses(folder: str | Path, sequence: str) -> Float[np.ndarray, "f 4 4"]:
 def read_frame(
     folder: str | Path, sequence: str, frame: int, voxel: float = VOXEL
 ) -> Float32[np.ndarray, "n 3"]:
-    """The points of one scan in meters, one per voxel; a voxel of 0 leaves the scan as it is."""
+    """The points of one scan in meters, one per voxel; with a voxel size of 0, all points."""
     path = Path(folder) / "sequences" / sequence / "velodyne" / f"{frame:06d}.bin"
     if not path.is_file():
         raise ValueError(f"no scan at {path}. {LAYOUT}")
@@ -193,7 +197,7 @@ def _numbers(
     except ValueError as error:
         raise ValueError(f"{path}: {error}; wanted {wanted}") from error
     if values.ndim != 2 or values.shape[1] != 12 or not np.isfinite(values).all():
-        raise ValueError(f"{path} is not as it should be; wanted {wanted}")
+        raise ValueError(f"{path} is malformed; wanted {wanted}")
     return values
 
 

@@ -1,4 +1,4 @@
-"""What a file or folder holds, told by how it is laid out; the kinds are in `data.kinds`."""
+"""Recognizes what a file or folder holds from its layout. The kinds are in `data.kinds`."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from cfr_jax.data.kinds.kind import DataKind
 
 @dataclass(frozen=True)
 class Layout:
-    """What was recognized, and where."""
+    """The kind of data that was recognized at a path."""
 
     kind: DataKind
     path: Path
     found: str
-    """In words, for whoever wonders what was made of their data."""
+    """What was found, in words, for users who want to know how their data was interpreted."""
 
     def __str__(self) -> str:
         return f"{self.path}: {self.found}"
 
 
 def recognize(path: str | Path, kind: str | None = None) -> Layout:
-    """The layout of a file or folder; `kind` overrules what it looks like, and is only checked.
+    """The layout of a file or folder. If `kind` is given, no other kind is tried.
 
-    Raises ValueError, with what is there and what was wanted, where nothing is recognized, where
-    nothing is there, and where the data are not of the `kind` given.
+    Raises ValueError, saying what is there and what was wanted, if nothing is there, if no kind is
+    recognized, or if the data is not of the given `kind`.
     """
     path = Path(path)
     if kind is not None:
         chosen = kinds.named(kind, "layout", kinds.known())
         if (found := chosen.recognize(_existing(path))) is not None:
             return Layout(chosen, path, found)
-        raise ValueError(f"{path} is not laid out as {kind}: it holds {_contents(path)}")
+        raise ValueError(f"{path} does not have the layout of {kind}: it holds {_contents(path)}")
     _existing(path)
     for each in kinds.known():
         found = each.recognize(path)
@@ -42,7 +42,7 @@ def recognize(path: str | Path, kind: str | None = None) -> Layout:
             return Layout(each, path, found)
     *words, last = (each.words for each in kinds.known())
     raise ValueError(
-        f"{path} is no data that is recognized: it holds {_contents(path)}\n"
+        f"{path} does not hold data of a known kind: it holds {_contents(path)}\n"
         f"wanted {', '.join(words)}, or {last}"
     )
 
@@ -56,7 +56,7 @@ def _existing(path: Path) -> Path:
 def _contents(path: Path) -> str:
     if path.is_file():
         size = path.stat().st_size
-        return f"{size} bytes under the suffix {path.suffix!r}" if size else "nothing (0 bytes)"
+        return f"{size} bytes, suffix {path.suffix!r}" if size else "nothing (0 bytes)"
     kinds = Counter(file.suffix.lower() or "no suffix" for file in path.iterdir())
     told = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(5))
     return told or "nothing"

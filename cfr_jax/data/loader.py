@@ -1,7 +1,7 @@
-"""Training batches: pairs drawn from sources, each from a seed of its own.
+"""Training batches: pairs drawn from sources, each with its own random seed.
 
-Which pair comes when is a function of (seed, position) alone: any number of workers draws the same
-pairs, and a run that resumes at a position goes on with the pair that it would have had.
+Which pair comes at a position depends only on (seed, position). So any number of workers draws the
+same pairs, and a run that resumes at a position continues with the pair it would have had.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ class Source(Protocol):
     def __len__(self) -> int: ...
 
     def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
-        """A pair made of item `index`, as `augment.finish_pair` gives it."""
+        """A pair made from item `index`, in the format of `augment.finish_pair`."""
         ...
 
 
 def batch_at(
     source: Source, position: int, size: int, sampling: Sampling, seed: int
 ) -> dict[str, np.ndarray]:
-    """The `size` pairs from `position` on of the endless shuffled stream; arrays (size, ...)."""
+    """`size` pairs of the endless shuffled stream, starting at `position`; arrays (size, ...)."""
     pairs = []
     for number, item in zip(
         range(position, position + size), items_at(len(source), position, size, seed), strict=True
@@ -43,8 +43,11 @@ def batch_at(
 
 
 def items_at(count: int, position: int, size: int, seed: int) -> Int[np.ndarray, " size"]:
-    """The items of `size` pairs from `position` on: each of `count` once an epoch, in an order that
-    belongs to seed and epoch."""
+    """The item indices of `size` pairs, starting at `position`.
+
+    Each of the `count` items comes once per epoch, in an order that depends on the seed and the
+    epoch.
+    """
     epochs, places = np.divmod(np.arange(position, position + size), count)
     return np.array(
         [
@@ -70,9 +73,10 @@ def batches(
     workers: int = 2,
     share: slice = slice(None),
 ) -> Iterator[dict[str, np.ndarray]]:
-    """`count` batches from `position` on, made by `workers` threads ahead of their use.
+    """`count` batches starting at `position`, prepared ahead of use by `workers` threads.
 
-    Of each batch only the rows in `share` are made: with several processes, each makes its own.
+    Only the rows of each batch that are in `share` are made, so that each of several processes
+    makes only its own. Raises ValueError for fewer than one worker.
     """
     if workers < 1:
         raise ValueError(f"workers: got {workers}, wanted at least 1")

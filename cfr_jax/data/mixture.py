@@ -1,11 +1,11 @@
-"""The data that a config asks for: a path to a corpus of shapes, or named sources of any kind.
+"""The data that a config names: a path to a corpus of shapes, or named sources of any kind.
 
     data.train = "train.h5"
     data.train = {"street": {"kind": "kitti", "path": ..., "frames": (0, 45), "repeat": 4}, ...}
 
-The kinds are those of `data.kinds`, or "auto" to have it told from the layout of the data; without
-one it is a corpus. `repeat` says how many times an epoch each item of a source comes; 0 leaves the
-source out. All else are settings of the kind.
+The kinds are those of `data.kinds`; "auto" recognizes the kind from the layout of the data, and the
+default is a corpus. `repeat` says how many times each item of a source comes per epoch; 0 leaves
+the source out. All other entries are settings of the kind.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from cfr_jax.data.sources import TrainingSource
 from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.runtime.progress import Progress
 
-_TOLD = 10  # scans that cannot be read, by name
+_TOLD = 10  # unreadable scans that are listed by name
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Several sources as one; `repeats[s]` times an epoch each item of source `s` comes."""
+    """Several sources as one. Each item of source `s` comes `repeats[s]` times per epoch."""
 
     sources: Sequence[TrainingSource]
     repeats: Sequence[int]
@@ -41,27 +41,27 @@ class Mixture:
         return sum(len(s) * r for s, r in zip(self.sources, self.repeats, strict=True))
 
     def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
-        """From the source that item `index` of the whole belongs to."""
+        """A pair from the source that item `index` of the mixture belongs to."""
         source, index = self.locate(index)
         return source.draw(index, sampling, rng)
 
     def locate(self, index: int) -> tuple[TrainingSource, int]:
-        """The source that item `index` of the whole belongs to, and its number there."""
+        """The source that item `index` of the mixture belongs to, and its index in that source."""
         for source, repeat in zip(self.sources, self.repeats, strict=True):
             if index < len(source) * repeat:
                 return source, index % len(source)
             index -= len(source) * repeat
-        raise IndexError(f"item {index} beyond the last")
+        raise IndexError(f"index: got one past the last of {len(self)} items")
 
     def told(self) -> str:
-        """How many items of what sort, in words."""
+        """How many items of each sort there are, in words."""
         counts: Counter[str] = Counter()
         for source, repeat in zip(self.sources, self.repeats, strict=True):
             counts[source.noun] += repeat * len(source)
         return " and ".join(f"{count} {noun}" for noun, count in counts.items())
 
     def stamp(self, *more: np.ndarray) -> str:
-        """What tells these data from others, wherever they lie; of `more`, four decimals."""
+        """Identifies the data regardless of its path; `more` is included to four decimals."""
         parts = [source.stamp for source in self.sources]
         parts += [f"{np.round(array.astype(np.float64), 4).tolist()}" for array in more]
         text = "\n".join([*parts, str(list(self.repeats))])
@@ -69,10 +69,10 @@ class Mixture:
 
 
 def open_mixture(given: Any, cache: Path, where: str) -> Mixture:
-    """The sources of `data.train` or `data.validation` (`where`) as one.
+    """The sources of `data.train` or `data.validation` (`where`) as one mixture.
 
-    Refined truths are kept in the folder `cache`. Raises ValueError, naming the field, where a
-    source is not as it should be, and OSError where it cannot be read.
+    Refined true motions are kept in the folder `cache`. Raises ValueError, naming the field, if a
+    source is malformed, and OSError if it cannot be read.
     """
     sources, repeats = [], []
     for name, about in _named(given, where).items():
@@ -88,24 +88,24 @@ def open_mixture(given: Any, cache: Path, where: str) -> Mixture:
 
 
 def check_apart(train: Mixture, validation: Mixture) -> None:
-    """Raises ValueError where a scan that is validated on is trained on, too."""
+    """Raises ValueError if a scan is used for both validation and training."""
     used, held = (
         frozenset().union(*(source.recorded for source in mixture.sources))
         for mixture in (train, validation)
     )
     if used & held:
         raise ValueError(
-            f"data.validation: {len(used & held)} of its {len(held)} scans are in data.train, too; "
-            "wanted scans of its own (see `frames`)"
+            f"data.validation: {len(used & held)} of its {len(held)} scans are also in data.train; "
+            "wanted scans that are not trained on (see `frames`)"
         )
 
 
 def check_readable(mixture: Mixture, cache: Path, where: str, remember: bool = True) -> None:
-    """Reads every scan once, before a training would come upon a bad one in its third hour.
+    """Reads every scan once, so that a bad one does not stop a training in its third hour.
 
-    What was found sound before, in the folder `cache`, is not read again; `remember` writes there
-    what is found sound now, which one process of several does. Raises ValueError with all that
-    cannot be read.
+    The folder `cache` lists the sources that were readable before; they are not read again. With
+    `remember`, newly checked sources are added to the list; only one of several processes should do
+    that. Raises ValueError, listing the scans that cannot be used.
     """
     file = cache / "readable"
     sound = set(file.read_text("utf-8").split()) if file.is_file() else set()
@@ -124,10 +124,10 @@ def check_readable(mixture: Mixture, cache: Path, where: str, remember: bool = T
 def fixed_pairs(
     mixture: Mixture, count: int, sampling: Sampling, neighbors: int, radius: float
 ) -> dict[str, np.ndarray]:
-    """The same `count` pairs every time, spread over the sources, as one batch.
+    """The same `count` pairs on every call, spread over the sources, as one batch.
 
-    How a pair is made is up to its source; one batch holds clouds of one size, which those of
-    shapes and those of scans are not.
+    Each source decides how its pairs are made. All clouds in a batch must have the same size, so
+    shapes and scans cannot be mixed. Raises ValueError if the sizes differ.
     """
     whole = Mixture(mixture.sources, [1] * len(mixture.sources))
     chosen = np.linspace(0, len(whole) - 1, min(count, len(whole))).astype(int)
@@ -156,7 +156,7 @@ def _read_all(source: TrainingSource, check: Callable[[int], object], where: str
         wrong = list(dict.fromkeys(wrong))
         more = f"\n... and {len(wrong) - _TOLD} more" if len(wrong) > _TOLD else ""
         raise ValueError(
-            f"{where}: {len(wrong)} scans cannot be used; mend them or take them out:\n"
+            f"{where}: {len(wrong)} scans cannot be used; repair or remove them:\n"
             + "\n".join(wrong[:_TOLD])
             + more
         )
@@ -177,7 +177,7 @@ def _open(about: dict[str, Any], cache: Path, where: str) -> TrainingSource:
         kind = kinds.named(name, f"{where}.kind", able)
     if path is None or not str(path):
         raise ValueError(
-            f"{where}.path: none given; wanted a file or a folder, as in --config.{where}.path=PATH"
+            f"{where}.path: got none, wanted a file or a folder, as in --config.{where}.path=PATH"
         )
     if name == "auto":
         layout = recognize(path)
@@ -187,11 +187,11 @@ def _open(about: dict[str, Any], cache: Path, where: str) -> TrainingSource:
                 f"{', '.join(kind.name for kind in able)}"
             )
         kind = layout.kind
-    assert kind.train is not None  # that is what makes it able
+    assert kind.train is not None  # as for all kinds in `able`
     needed, allowed = settings_of(kind.train)
     if set(about) - allowed or needed - set(about):
         raise ValueError(
-            f"{where}: {kind.name} got {sorted(about)}, wanted path, and perhaps "
+            f"{where}: {kind.name} got {sorted(about)}, wanted path and, optionally, "
             f"{', '.join(sorted(allowed)) or 'repeat'}"
         )
     return kind.train(path, cache, **about)

@@ -1,4 +1,4 @@
-"""ModelNet40 as the field distributes it, and the three splits registration papers make of it."""
+"""ModelNet40 in its usual HDF5 form, and the three splits that registration papers use."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from cfr_jax.data.corpus import Corpus, read_corpus
 
 Split = Literal["train", "val", "test"]
 
-SEEN = 20  # of the 40 categories; the others are met only in the test
+SEEN = 20  # of the 40 categories are seen in training; the others appear only in the test
 WHERE = (
-    "Get modelnet40_ply_hdf5_2048.zip (415 MB; "
+    "Download modelnet40_ply_hdf5_2048.zip (415 MB; "
     "https://shapenet.cs.stanford.edu/media/modelnet40_ply_hdf5_2048.zip, or the mirror "
     "https://rpmnet.s3.us-east-2.amazonaws.com/modelnet40_ply_hdf5_2048.zip) and unpack it. Its "
     "folder holds shape_names.txt, train_files.txt, test_files.txt, ply_data_train0.h5 to "
@@ -22,13 +22,14 @@ WHERE = (
 def read_modelnet40(folder: str | Path, split: Split) -> Corpus:
     """One of the published splits of the folder `modelnet40_ply_hdf5_2048`.
 
-    `train` holds the train files and `val` the test files of the first 20 categories by alphabet,
-    `test` the test files of the other 20: shapes of a kind never trained on. Shapes keep the order
-    of the lists, which is the order that `fixed_pair` counts in; labels go on numbering all 40.
-    Raises ValueError where something is missing, and says where to get it.
+    For the first 20 categories in alphabetical order, `train` holds the shapes of the training
+    files and `val` those of the test files. `test` holds the shapes of the test files in the other
+    20 categories, which are never trained on. Shapes keep the order of the file lists, and
+    `fixed_pair` counts in that order. Labels still refer to all 40 categories. Raises ValueError if
+    something is missing, and says where to get it.
     """
     if split not in get_args(Split):
-        raise ValueError(f"split is {split!r}, wanted one of {get_args(Split)}")
+        raise ValueError(f"split: got {split!r}, wanted one of {get_args(Split)}")
     folder = Path(folder)
     corpus = read_corpus(_listed(folder, "train" if split == "train" else "test"))
     categories = sorted(corpus.categories)
@@ -40,7 +41,8 @@ def read_modelnet40(folder: str | Path, split: Split) -> Corpus:
 
 
 def _listed(folder: Path, half: str) -> list[Path]:
-    """The files of a list, whose lines carry a folder of the machine where they were made."""
+    """The files in a list. Its lines start with a folder of the machine that the list comes from,
+    so only their names are used."""
     for needed in (f"{half}_files.txt", "shape_names.txt"):
         if not (folder / needed).is_file():
             raise ValueError(f"{folder} has no {needed}. {WHERE}")

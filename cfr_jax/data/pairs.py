@@ -1,12 +1,13 @@
-"""A pair of clouds to register, and the files that hold many of them.
+"""A pair of clouds to register, and the files that hold many pairs.
 
-`CsvPairs` and `Hdf5Pairs` give the same `Pair`, one at a time and only when asked for:
+`CsvPairs` and `Hdf5Pairs` read a `Pair` only when it is accessed:
 
-    CSV   a line a pair: the files of source and target, which may be anything `cfr_jax.io` reads,
-          relative to the folder of the list, then perhaps 16 numbers, the true motion row by row.
-          Passed over: a first line `source,target,...`, empty lines, lines that start with #.
-    HDF5  a group a pair with `source` (N, 3), `target` (M, 3), and perhaps `source_normals`,
-          `target_normals`, `transform` (4, 4), and a number `overlap`.
+    CSV   one line per pair: the files of source and target, in any format that `cfr_jax.io` reads
+          and relative to the folder of the list, then optionally 16 numbers, the true motion row by
+          row. A first line `source,target,...`, empty lines, and lines that start with # are
+          skipped.
+    HDF5  one group per pair, with `source` (N, 3), `target` (M, 3), and optionally
+          `source_normals`, `target_normals`, `transform` (4, 4), and a number `overlap`.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ from cfr_jax.geometry.motions import check_rigid
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two clouds and what is known about them; None stands for what is not.
+    """Two clouds and what is known about them; None means not known.
 
-    `transform` is the truth, and maps source onto target: `transform @ [x; 1]`. `overlap` is the
-    share of the source that the target saw too. `clean_source` and `clean_target` are the whole
-    shapes without noise or crop, each in the frame of its cloud. Units are the file's.
+    `transform` is the true motion; it maps source onto target: `transform @ [x; 1]`. `overlap` is
+    the share of the source that is also in the target. `clean_source` and `clean_target` are the
+    whole shapes without noise or crop, each in the frame of its cloud. Units are those of the file.
     """
 
     name: str
@@ -45,8 +46,10 @@ class Pair:
 
 
 def among(chosen: tuple[int, int] | None, frames: Iterable[int | str]) -> bool:
-    """Whether all `frames` of a pair are numbers from the first of `chosen` up to, not including,
-    the second; None chooses all. A name instead of a number is in no range."""
+    """Whether all `frames` of a pair are numbers in the half-open range `chosen`.
+
+    None chooses all pairs. A frame that is a name, not a number, is in no range.
+    """
     return chosen is None or all(
         isinstance(frame, int) and chosen[0] <= frame < chosen[1] for frame in frames
     )
@@ -73,7 +76,7 @@ class _OneByOne(Sequence[Pair]):
 
 
 class PairsOnDemand(_OneByOne):
-    """`count` pairs, number i being `make(i)`, made whenever it is asked for."""
+    """`count` pairs, where pair i is `make(i)`, made each time it is accessed."""
 
     def __init__(self, count: int, make: Callable[[int], Pair]):
         self._count, self._make = count, make
@@ -86,7 +89,7 @@ class PairsOnDemand(_OneByOne):
 
 
 class PairFile(_OneByOne):
-    """Pairs of a file in its order; `names` tells them apart without reading any cloud."""
+    """The pairs of a file, in its order. `names` is available without reading any cloud."""
 
     path: Path
     names: tuple[str, ...]
@@ -94,14 +97,14 @@ class PairFile(_OneByOne):
     def __init__(self, path: str | Path):
         self.path = Path(path)
         if not self.path.is_file():
-            raise ValueError(f"no file of pairs at {path}")
+            raise ValueError(f"path: there is no file of pairs at {path}")
 
     def __len__(self) -> int:
         return len(self.names)
 
 
 class CsvPairs(PairFile):
-    """A list of pairs; the list is checked when it is opened, each cloud when it is read."""
+    """A list of pairs. The list is checked when it is opened, and each cloud when it is read."""
 
     def __init__(self, path: str | Path):
         super().__init__(path)
@@ -114,20 +117,20 @@ class CsvPairs(PairFile):
                     if row:
                         self._rows.append(row)
         except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{self.path} is no list in CSV ({error})") from error
+            raise ValueError(f"{self.path} is not a CSV list ({error})") from error
         if not self._rows:
-            raise ValueError(f"{self.path} lists no pair; wanted lines of `source,target`")
+            raise ValueError(f"{self.path} lists no pairs; wanted lines of `source,target`")
         self.names: tuple[str, ...] = tuple(
             f"{source} -> {target}" for source, target, _ in self._rows
         )
 
     @property
     def listed(self) -> list[tuple[str, str]]:
-        """Source and target of each pair, as the list has them."""
+        """Source and target of each pair, as written in the list."""
         return [(source, target) for source, target, _ in self._rows]
 
     def _read(self, index: int) -> Pair:
-        from cfr_jax.io import read  # reading formats pulls in what a mere list does not need
+        from cfr_jax.io import read  # imported here: a list alone does not need the readers
 
         source_file, target_file, transform = self._rows[index]
         source = read(self.path.parent / source_file)
@@ -155,11 +158,14 @@ class Hdf5Pairs(PairFile):
         except OSError as error:
             raise ValueError(f"{self.path} is not an HDF5 file ({error})") from error
         if not self.names:
-            raise ValueError(f"{self.path} holds no group; wanted one a pair: source, target, ...")
+            raise ValueError(f"{self.path} has no groups; wanted one per pair: source, target, ...")
 
     def frames(self, index: int) -> tuple[str | int, str | int]:
-        """What the source and the target of a pair were recorded from: the numbers
-        `source_frame` and `target_frame` of the group, or names of this pair's own."""
+        """Frames that the source and the target of a pair were recorded from.
+
+        These are the group's attributes `source_frame` and `target_frame`, or names that are unique
+        to the pair if it lacks them.
+        """
         name = self.names[index]
         with h5py.File(self.path, "r") as file:
             said = file[name].attrs
@@ -174,7 +180,7 @@ class Hdf5Pairs(PairFile):
             held = {key: np.asarray(value) for key, value in file[name].items()}
         missing = [key for key in ("source", "target") if key not in held]
         if missing:
-            raise ValueError(f"{where} lacks {missing}, it holds {sorted(held)}")
+            raise ValueError(f"{where} lacks {missing}, and holds only {sorted(held)}")
         for key in ("source", "target", "source_normals", "target_normals"):
             if key in held:
                 held[key] = _checked_rows(
@@ -193,7 +199,7 @@ class Hdf5Pairs(PairFile):
 
 
 def with_truth(held: PairFile, index: int) -> Pair:
-    """Pair `index`; raises ValueError where its true transform is not known."""
+    """Pair `index`. Raises ValueError if its true transform is not known."""
     pair = held[index]
     if pair.transform is None:
         raise ValueError(f"{held.path}: {pair.name} has no true transform to learn from")
@@ -203,7 +209,7 @@ def with_truth(held: PairFile, index: int) -> Pair:
 def _parse_row(
     cells: list[str], path: Path, line: int
 ) -> tuple[str, str, Float[np.ndarray, "4 4"] | None] | None:
-    """Source, target and truth of a line, or None where the line is not a pair."""
+    """Source, target and true motion of a line, or None if the line is not a pair."""
     header = line == 1 and [cell.lower() for cell in cells[:2]] == ["source", "target"]
     if header or not any(cells) or cells[0].startswith("#"):
         return None
@@ -218,7 +224,9 @@ def _parse_row(
     except ValueError as error:
         raise ValueError(f"{where}: {error}; wanted 16 numbers after the two files") from error
     if len(values) != 16:
-        raise ValueError(f"{where}: {len(values)} numbers after the two files, wanted 16 or none")
+        raise ValueError(
+            f"{where}: got {len(values)} numbers after the two files, wanted 16 or none"
+        )
     return source, target, check_rigid(f"{where}: transform", values.reshape(4, 4))
 
 

@@ -1,8 +1,8 @@
 """Pairs made from shapes: the published test procedures, and the same operations for training.
 
-The operations draw from the generator they are given and do nothing else that is random, so that
-`fixed_pair` repeats, draw by draw, the test set on which RPM-Net (Yew & Lee, 2020) and its
-successors publish their results. A generator is numpy's legacy `RandomState` or a `Generator`.
+All random numbers come from the generator that is passed in, in a fixed order. So `fixed_pair`
+repeats, draw by draw, the test set on which RPM-Net (Yew & Lee, 2020) and its successors publish
+their results. A generator is numpy's legacy `RandomState` or a `Generator`.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ NOISE_CLIP = 0.05
 
 @dataclass(frozen=True)
 class Protocol:
-    """How a pair is made of a shape.
+    """How a pair is made from a shape.
 
-    Without crop and without noise the two clouds hold the very same points, drawn once, and those
-    are the whole shape as far as the pair knows; otherwise each cloud is drawn on its own.
+    Without crop and noise, the two clouds hold the same points, drawn once, and the pair's clean
+    clouds are those points. Otherwise each cloud draws its own points.
     """
 
     name: str
-    points: int = 1024  # of a whole shape; a cropped cloud has ceil(keep * points)
-    keep: float | None = None  # share of the shape that a crop leaves
-    noise: bool = True  # N(0, 0.01), clipped to 0.05
+    points: int = 1024  # of an uncropped cloud; a cropped one has ceil(keep * points)
+    keep: float | None = None  # share of the shape that a crop keeps
+    noise: bool = True  # N(0, 0.01), clipped at 0.05
     angle: float | None = 45.0  # degrees; each Euler angle from [0, angle]; None: any rotation
-    both_ways: bool = False  # each angle from [-angle, angle] instead, as users' clouds may be
+    both_ways: bool = False  # each angle from [-angle, angle] instead, as in users' clouds
     translation: float = 0.5  # each coordinate is drawn from [-translation, translation]
 
     def __post_init__(self) -> None:
         if self.points < 1:
-            raise ValueError(f"points is {self.points}, wanted at least 1")
+            raise ValueError(f"points: got {self.points}, wanted at least 1")
         if self.keep is not None and not 0 < self.keep < 1:
-            raise ValueError(f"keep is {self.keep}, wanted None or a share between 0 and 1")
+            raise ValueError(f"keep: got {self.keep}, wanted None or a share between 0 and 1")
 
 
 clean: Final = Protocol("clean", noise=False)
@@ -61,7 +61,10 @@ PROTOCOLS = {
 
 
 def fixed_pairs(corpus: Corpus, protocol: str) -> PairsOnDemand:
-    """The published test set that the protocol of this name makes of `corpus`."""
+    """The published test set for `corpus` by the protocol of this name.
+
+    Raises ValueError for an unknown protocol.
+    """
     if protocol not in PROTOCOLS:
         raise ValueError(f"protocol: got {protocol!r}, wanted one of {', '.join(PROTOCOLS)}")
     chosen = PROTOCOLS[protocol]
@@ -69,13 +72,14 @@ def fixed_pairs(corpus: Corpus, protocol: str) -> PairsOnDemand:
 
 
 def fixed_pair(corpus: Corpus, index: int, protocol: Protocol) -> Pair:
-    """Pair `index` of the published test set that `protocol` makes of `corpus`.
+    """Pair `index` of the published test set for `corpus` by `protocol`.
 
-    The legacy generator starts anew from the index before the crop, the motion and the draw of
-    points; `clean` takes the first points instead of drawing.
+    The legacy generator is reseeded with the index before the crop, before the motion, and before
+    the draw of points. `clean` takes the first points instead of drawing. Raises ValueError for an
+    index out of range.
     """
     if not 0 <= index < len(corpus):
-        raise ValueError(f"index is {index}, wanted 0 to {len(corpus) - 1}")
+        raise ValueError(f"index: got {index}, wanted 0 to {len(corpus) - 1}")
     points, normals = corpus[index]
     first = np.arange(protocol.points) % len(points)
     return _make_pair(
@@ -95,7 +99,7 @@ def random_pair(
     rng: Rng,
     name: str = "",
 ) -> Pair:
-    """A fresh pair of a shape, for training."""
+    """A new random pair from a shape, for training."""
     return _make_pair(
         name,
         points,
@@ -107,10 +111,10 @@ def random_pair(
 
 
 def crop(points: Float[np.ndarray, "p 3"], keep: float, rng: Rng) -> Int[np.ndarray, " kept"]:
-    """Rows on the far side of a plane with a random normal that leaves a share of `keep`.
+    """Rows that a crop keeps: those beyond a plane with a random normal, a share of `keep`.
 
-    At exactly one half the plane goes through the mean, as in the published low-overlap sets, so
-    the share is one half only roughly. Raises ValueError where no point is left.
+    For exactly one half the plane goes through the mean, as in the published low-overlap sets, so
+    the share is only roughly one half. Raises ValueError if no point is left.
     """
     azimuth = rng.uniform(0.0, 2 * np.pi)
     polar = np.arccos(rng.uniform(-1.0, 1.0))
@@ -118,12 +122,15 @@ def crop(points: Float[np.ndarray, "p 3"], keep: float, rng: Rng) -> Int[np.ndar
         [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
     )
     height = (points - points.mean(axis=0)) @ direction
-    # The published share is a float32; in float64, (1 - 0.7) * 100 is then not quite 30.
+    # The published share is a float32, so in float64 (1 - 0.7) * 100 is not quite 30.
     percentile = (1.0 - float(np.float32(keep))) * 100
     plane = 0.0 if keep == 0.5 else np.percentile(height, percentile)
     kept = np.flatnonzero(height > plane)
     if not len(kept):
-        raise ValueError(f"a crop to {keep} leaves none of {len(points)} points: all are alike")
+        raise ValueError(
+            f"points: a crop to {keep} leaves none of {len(points)} points, wanted a cloud whose "
+            "points do not coincide"
+        )
     return kept
 
 
@@ -132,8 +139,9 @@ def random_motion(
 ) -> Float32[np.ndarray, "4 4"]:
     """R = Rx Ry Rz with each angle in [0, angle] degrees, then a translation within a cube.
 
-    `both_ways` draws the angles from [-angle, angle]. Without an angle the rotation is any, uniform
-    over SO(3): that of a random unit quaternion.
+    `both_ways` draws the angles from [-angle, angle]. If `angle` is None, the rotation is uniform
+    over SO(3), from a random unit quaternion. Each coordinate of the translation is in
+    [-translation, translation].
     """
     motion = np.eye(4)
     if angle is None:
@@ -151,7 +159,7 @@ def random_motion(
 
 
 def resample(size: int, count: int, rng: Rng) -> Int[np.ndarray, " count"]:
-    """`count` of `size` rows, none twice; if there are too few, all of them and some again."""
+    """`count` of `size` rows, without repeats; if there are too few, all of them plus repeats."""
     if count <= size:
         return rng.choice(size, count, replace=False)
     return np.concatenate(
@@ -160,7 +168,7 @@ def resample(size: int, count: int, rng: Rng) -> Int[np.ndarray, " count"]:
 
 
 def jitter(points: Float32[np.ndarray, "n 3"], rng: Rng) -> Float32[np.ndarray, "n 3"]:
-    """Points with clipped Gaussian noise; normals are left exact by all protocols."""
+    """Points with clipped Gaussian noise. All protocols leave the normals exact."""
     drawn = rng.normal(0.0, NOISE_SCALE, points.shape)
     return (points + np.clip(drawn, -NOISE_CLIP, NOISE_CLIP)).astype(np.float32)
 
@@ -173,7 +181,7 @@ def _make_pair(
     reseed: Callable[[], Rng],
     shared: Callable[[Rng], Int[np.ndarray, " n"]],
 ) -> Pair:
-    """The operations in their published order: source first, but the target is shuffled first."""
+    """Applies the operations in their published order: source first, except in the shuffle."""
     if protocol.keep is None and not protocol.noise:
         chosen = shared(reseed())
         points, normals = points[chosen], normals[chosen]
@@ -189,7 +197,7 @@ def _make_pair(
 
     rng = reseed()
     motion = random_motion(protocol.angle, protocol.translation, rng, both_ways=protocol.both_ways)
-    # the cropped rows are moved, as published: a product of all rows may round its last bit apart
+    # crop before moving, as published: moving all rows may round the last bit differently
     source = motions.apply(motion, points[source_rows])
     source_normals = motions.rotate(motion, normals[source_rows])
     target, target_normals = points[target_rows], normals[target_rows]

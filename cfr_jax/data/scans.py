@@ -1,4 +1,4 @@
-"""What a raw scan needs on the host before it is a pair: thinning, normals, a refined truth."""
+"""Prepares raw scans on the host: thinning, normals, and refined true motions."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from scipy.spatial import cKDTree
 
 from cfr_jax.geometry import motions
 
-# Open3D's stopping rule, whose truths the published KITTI pairs use.
+# Open3D's stopping rule; the published KITTI pairs were refined with Open3D.
 SETTLED = 1e-6
 MAX_ITERATIONS = 200
 
 
 class Refined(NamedTuple):
-    """A motion of source onto target, and the share of the source that it brings close."""
+    """A motion of source onto target, and the share of source points it brings near the target."""
 
     transform: Float[np.ndarray, "4 4"]
     fitness: float
 
 
 def voxel_mean(points: Float[np.ndarray, "n 3"], size: float) -> Float[np.ndarray, "m 3"]:
-    """One point, the mean, per occupied cube of a grid with edges of `size`."""
+    """The mean point of each occupied cube in a grid with edges of length `size`."""
     if not size > 0:
-        raise ValueError(f"size is {size}, wanted a positive length")
-    # The grid starts half a cube before the lowest point, as Open3D's does.
+        raise ValueError(f"size: got {size}, wanted a positive length")
+    # The grid starts half a cube below the lowest coordinates, as in Open3D.
     offsets = points.astype(np.float64) - points.min(axis=0)
     cubes = np.floor(offsets / size + 0.5).astype(np.int64)
     _, cube, counts = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
@@ -40,11 +40,11 @@ def estimate_normals(
     most: int = 30,
     viewpoint: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Float[np.ndarray, "n 3"]:
-    """Unit normals that face the viewpoint, which in a scan is the sensor.
+    """Unit normals that face the viewpoint, which is the sensor in a scan.
 
-    The direction of least spread (Hoppe et al., 1992) of at most `most` nearest points within
-    `radius`, the point itself among them. A point with fewer than two others there has no surface
-    around it: its normal is some unit vector.
+    A normal is the direction of least spread (Hoppe et al., 1992) of the nearest points within
+    `radius`, at most `most` including the point itself. If fewer than two others lie there, the
+    surface is not determined, and the normal is some unit vector.
     """
     most = min(most, len(points))
     distances, rows = cKDTree(points).query(
@@ -67,11 +67,11 @@ def refine_point_to_plane(
     initial: Float[np.ndarray, "4 4"],
     threshold: float,
 ) -> Refined:
-    """Point-to-plane ICP (Chen & Medioni, 1991) from an initial motion, for making truths.
+    """Point-to-plane ICP (Chen & Medioni, 1991) from an initial motion, to make true motions.
 
-    Source points further than `threshold` from the target have no say. Directions in which the
-    planes leave the source free keep their initial value. A source that comes close nowhere is
-    answered with the initial motion and fitness 0.
+    Source points farther than `threshold` from the target are ignored. In directions that the
+    planes do not constrain, the motion keeps its initial value. If no source point is close enough,
+    the iteration ends with the motion it has (at first, the initial one) and fitness 0.
     """
     tree = cKDTree(target)
     transform = np.array(initial, np.float64)
@@ -98,7 +98,7 @@ def _plane_step(
     targets: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, "4 4"]:
-    """The motion that, to first order, brings points nearest to the planes of their targets."""
+    """The motion that, to first order, brings the points closest to their target planes."""
     center = points.mean(axis=0)
     rows = np.concatenate([np.cross(points - center, normals), normals], axis=1)
     heights = np.einsum("ni,ni->n", targets - points, normals)

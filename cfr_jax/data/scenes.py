@@ -1,7 +1,7 @@
 """Training pairs from scans: pairs with a known motion, or single scans.
 
-Every pair is brought to the network as `align` does it: each cloud about its own centroid, both in
-the unit sphere, thinned evenly. Scans without normals have them estimated.
+Each pair is prepared as in `align`: each cloud is centered at its own centroid, both are scaled
+into the unit sphere, and both are thinned evenly. Missing normals are estimated.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from cfr_jax.geometry import units
 from cfr_jax.io import formats
 from cfr_jax.io.formats import by_suffix
 
-_HELD = 128  # pairs in memory: reading one takes longer than drawing from it
-_MOST = 1 << 16  # points of a cloud in memory, drawn at random: scans of any size then fit
-_FEWEST = 16  # points that differ: of fewer, crops and neighborhoods are no surfaces
+_HELD = 128  # pairs kept in memory, because reading one takes longer than drawing from it
+_MOST = 1 << 16  # points kept of a cloud, drawn at random, so that scans of any size fit in memory
+_FEWEST = 16  # distinct points; with fewer, crops and neighborhoods do not form surfaces
 
 
 @dataclass(frozen=True, eq=False)
 class SceneSource:
-    """Scans in pairs; `frames[i]` names what item `i` was recorded from.
+    """Pairs of scans. `frames[i]` names the recordings that item `i` comes from.
 
-    `single`: both clouds of an item are one scan, of which views are to be drawn. `stamp` changes
-    with the names and sizes of the files.
+    If `single`, both clouds of an item are the same scan, and training draws two views of it.
+    `stamp` changes with the names and sizes of the files.
     """
 
     names: tuple[str, ...]
@@ -49,21 +49,21 @@ class SceneSource:
 
     @property
     def noun(self) -> str:
-        """What the items are called."""
+        """What the items are called, in the plural."""
         return "single scans" if self.single else "pairs of scans"
 
     @property
     def recorded(self) -> frozenset[Hashable]:
-        """All that any item was recorded from."""
+        """All recordings that items come from."""
         return frozenset(frame for item in self.frames for frame in item)
 
     @property
     def check(self) -> Callable[[int], object]:
-        """Items are read when they are drawn; `read` finds the bad ones before."""
+        """`read`, which finds bad items in advance. Otherwise they are read only when drawn."""
         return self.read
 
     def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
-        """A crop and a draw of points of each cloud, in the unit sphere."""
+        """A pair in the unit sphere, from a crop and a draw of points of each cloud."""
         pair = self.read(index)
         try:
             return self._draw(pair, sampling, rng)
@@ -78,9 +78,12 @@ class SceneSource:
         radius: float,
         rng: np.random.Generator,
     ) -> dict[str, Any]:
-        """A recorded pair as it is, thinned to `sampling.points` and turned by up to 45 degrees
-        about each axis. Of a single scan two views are drawn by `sampling`, as in training: whole,
-        it would be laid on itself."""
+        """A recorded pair, thinned to `sampling.points` and rotated by up to 45 degrees about each
+        axis.
+
+        For a single scan, two views are drawn with `sampling`, as in training, because the whole
+        scan would be registered with itself.
+        """
         fewer = min(neighbors, sampling.points - 1)
         if self.single:
             chosen = dataclasses.replace(sampling, neighbors=fewer, radius=radius)
@@ -125,15 +128,16 @@ def scene_source(
     files: Sequence[Path],
     single: bool = False,
 ) -> SceneSource:
-    """A source whose pairs `read` gives, with their truths; the last ones stay in memory.
+    """A source of the pairs that `read` returns; the most recent ones are kept in memory.
 
-    `names` and `frames` are those of `SceneSource`, one of each item; `files` are all that is read,
-    for the stamp. Raises ValueError where there is no item.
+    Each pair needs its true motion. `names` and `frames` are those of `SceneSource`, with one entry
+    per item. `files` are all files that are read, for the stamp. Raises ValueError if there are no
+    items.
     """
     if not names:
         clouds = " ".join(by_suffix(form for form in formats.of_clouds() if form.loose))
-        wanted = clouds if single else "pairs, and some within `frames`"
-        raise ValueError(f"{path}: no scan to train on there; wanted {wanted}")
+        wanted = f"files ending in {clouds}" if single else "pairs, and some within `frames`"
+        raise ValueError(f"{path}: found no scans to train on, wanted {wanted}")
     sizes = [file.stat().st_size if file.is_file() else -1 for file in files]
     stamp = hashlib.sha256(repr((list(names), sizes)).encode()).hexdigest()
 
@@ -154,8 +158,8 @@ def scene_source(
 def _held(
     where: object, points: np.ndarray, normals: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """What is kept in memory of a scan; raises ValueError for one that teaches nothing."""
-    few = points[:: max(1, len(points) // 256)]  # enough to see whether all lie in one place
+    """The part of a scan that is kept in memory. Raises ValueError if it has too few places."""
+    few = points[:: max(1, len(points) // 256)]  # enough to see whether all points coincide
     if len(np.unique(few, axis=0)) < _FEWEST:
         raise ValueError(
             f"{where} has {len(points)} points, wanted at least {_FEWEST} in different places"

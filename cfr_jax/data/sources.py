@@ -1,6 +1,6 @@
-"""What training pairs come from: the interface of all sources, and the one of shapes.
+"""Sources of training pairs: the interface of all sources, and the source of shapes.
 
-The one of scans is in `data.scenes`; several are mixed by `data.mixture`.
+The source of scans is in `data.scenes`. `data.mixture` mixes several sources.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cfr_jax.geometry.neighbors import nearest_on_host
 
 @runtime_checkable
 class TrainingSource(Source, Protocol):
-    """A source that can tell what it holds, and be validated on."""
+    """A source that can describe its data and provide validation pairs."""
 
     @property
     def noun(self) -> str:
@@ -30,18 +30,23 @@ class TrainingSource(Source, Protocol):
 
     @property
     def stamp(self) -> str:
-        """Changes when the data do, and not with the place where they lie."""
+        """A string that changes if the data changes, but not if it is moved."""
         ...
 
     @property
     def recorded(self) -> frozenset[Hashable]:
-        """Names of the recordings that it uses, which no other source may be validated on."""
+        """Names of the recordings that it uses.
+
+        A recording must not be used for both training and validation.
+        """
         ...
 
     @property
     def check(self) -> Callable[[int], object] | None:
-        """Reads item i, and raises ValueError where it cannot be used; None if the source read all
-        of its items when it was opened."""
+        """A function that reads item i and raises ValueError if it cannot be used.
+
+        None if the source read all of its items when it was opened.
+        """
         ...
 
     def fixed_pair(
@@ -52,7 +57,7 @@ class TrainingSource(Source, Protocol):
         radius: float,
         rng: np.random.Generator,
     ) -> dict[str, Any]:
-        """A pair of item `index` to validate on, as `augment.finish_pair` gives it."""
+        """A validation pair from item `index`, in the format of `augment.finish_pair`."""
         ...
 
 
@@ -71,13 +76,13 @@ class ShapeSource:
 
     @property
     def stamp(self) -> str:
-        """Of all names, and of some of the points."""
+        """A digest of all names and of some of the points."""
         digest = hashlib.sha256("\n".join(self.corpus.names).encode())
         digest.update(self.corpus.points[:, ::64].tobytes())
         return digest.hexdigest()
 
     def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
-        """Each cloud is a crop and a draw of points of its own."""
+        """A pair from one shape. Each cloud has its own crop and its own draw of points."""
         points, normals = self.corpus[index]
         uneven = rng.random() < sampling.uneven
         views = []
@@ -95,7 +100,8 @@ class ShapeSource:
         radius: float,
         rng: np.random.Generator,
     ) -> dict[str, Any]:
-        """By the published partial protocol, 717 points; nothing else decides about it."""
+        """A pair by the published partial protocol, with 717 points. It ignores `sampling` and
+        `rng`."""
         pair = protocol.fixed_pair(self.corpus, index, protocol.partial)
         made = {"transform": pair.transform, "estimate_normals": False}
         for side in ("source", "target"):

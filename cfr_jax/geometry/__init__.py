@@ -1,1 +1,1 @@
-"""Arrays of points and motions: nothing is learned here, and nothing is read."""
+"""Arrays of points and motions. Nothing here is learned or read from files."""

@@ -1,10 +1,10 @@
-"""Small symmetric matrices: all eigenvectors of a 3x3, for normals; the leading one of a 4x4, for
-rotations; the solution of a 6x6 system, for steps.
+"""Small symmetric matrices: all eigenvectors of a 3x3 matrix (for normals), the leading eigenvector
+of a 4x4 matrix (for rotations), and the solution of a 6x6 system (for refinement steps).
 
-`jnp.linalg` calls solvers made for large matrices: a batch of 3x3 takes longer there than the whole
-network on a GPU. Cyclic Jacobi (Golub & Van Loan, ch. 8.5) never fails, needs no branch, and
-written out by components it is plain vector arithmetic over a batch. A single eigenvector takes
-less: the power method, its powers by squaring.
+`jnp.linalg` calls solvers made for large matrices: on a GPU, a batch of 3x3 matrices takes longer
+there than the whole network. Cyclic Jacobi (Golub & Van Loan, ch. 8.5) never fails and needs no
+branch. Written out by components, it is plain vector arithmetic over a batch. A single eigenvector
+needs less work: the power method, with powers computed by repeated squaring.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-# Converges quadratically: on random matrices, on rank-deficient ones and on ones with repeated
-# eigenvalues the fifth sweep no longer changes a float32 result (tests/geometry/test_eigen.py).
+# Jacobi converges quadratically. For random matrices, rank-deficient ones, and ones with repeated
+# eigenvalues, the fifth sweep no longer changes a float32 result (tests/geometry/test_eigen.py).
 SWEEPS = 5
-# The power 2^20 tells eigenvalues apart that differ by a millionth of the largest: nothing closer
-# has a meaning in float32.
+# The power 2^20 separates eigenvalues that differ by a millionth of the largest. Smaller
+# differences have no meaning in float32.
 SQUARINGS = 20
 _HIGHEST = lax.Precision.HIGHEST
 _Entries = dict[tuple[int, int], Array]
 
 
-@functools.partial(jax.jit, static_argnames=("sweeps",))  # so that its many scalars are traced once
+@functools.partial(jax.jit, static_argnames=("sweeps",))  # traces its many scalars only once
 def symmetric_eigen(
     matrix: Float[Array, "d d"], *, sweeps: int = SWEEPS
 ) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
-    """Eigenvalues, in no order, and their unit eigenvectors as columns.
+    """Eigenvalues, in no particular order, and their unit eigenvectors as columns.
 
-    Not meant to be differentiated: eigenvectors have no finite derivative where eigenvalues meet.
-    Callers state the derivative of what they make of them.
+    Not meant to be differentiated: eigenvectors have no finite derivative where eigenvalues
+    coincide. Callers define the derivative of what they compute from them.
     """
     d = matrix.shape[0]
     entries = {(i, j): matrix[i, j] for i in range(d) for j in range(i, d)}
@@ -50,29 +50,29 @@ def symmetric_eigen(
 def leading_eigenvector(
     matrix: Float[Array, "d d"], *, squarings: int = SQUARINGS
 ) -> Float[Array, " d"]:
-    """An eigenvector, of any length but zero, of the largest eigenvalue of a symmetric matrix whose
-    eigenvalues sum to zero.
+    """An eigenvector for the largest eigenvalue of a symmetric matrix with trace zero.
 
-    Where the largest eigenvalues agree, a vector that they share; the first axis for zero. Not
-    meant to be differentiated, as `symmetric_eigen`.
+    Its length is arbitrary but not zero. If several eigenvalues are the largest, it is a vector of
+    their common eigenspace; for the zero matrix it is the first axis. Like `symmetric_eigen`, not
+    meant to be differentiated.
     """
     identity = jnp.eye(len(matrix), dtype=matrix.dtype)
     size = jnp.sqrt(jnp.sum(matrix * matrix))
-    # As the eigenvalues sum to zero, half the norm lifts the largest above the absolute value of
-    # the smallest, so that it leads in the powers, too.
+    # Because the eigenvalues sum to zero, adding half the norm makes the largest one exceed the
+    # absolute value of the smallest, so that it also dominates the powers.
     lifted = jnp.where(size > 0, matrix + size / 2 * identity, jnp.diag(identity[0]))
     power = _repeated(_squared, squarings, lifted)
     vector = power[jnp.argmax(jnp.diagonal(power))]
-    for _ in range(2):  # what the squares have gathered of rounding shrinks under the matrix itself
+    for _ in range(2):  # multiplying by the matrix itself reduces the squarings' rounding errors
         vector = jnp.sum(lifted * vector, axis=1)
     return vector
 
 
 @jax.jit
 def solve_positive(matrix: Float[Array, "d d"], right: Float[Array, " d"]) -> Float[Array, " d"]:
-    """x with matrix x = right, for a symmetric positive definite matrix.
+    """Solves matrix x = right for a symmetric positive definite matrix.
 
-    Gauss-Jordan elimination: no pivot needs to be searched where all are positive.
+    Gauss-Jordan elimination. No pivot search is needed, because all pivots are positive.
     """
     rows = jnp.concatenate([matrix, right[:, None]], axis=1)
     return _repeated(_eliminate, len(matrix), rows)[:, -1]
@@ -86,8 +86,11 @@ def _eliminate(k: Array | int, rows: Float[Array, "d e"]) -> Float[Array, "d e"]
 
 
 def _repeated(step: Callable[[Any, Any], Any], count: int, state: Any) -> Any:
-    """`step(i, state)` for i below `count`. Accelerators get it written out: in a loop, each number
-    that is carried would be copied by a kernel of its own. On a CPU a loop compiles faster."""
+    """Applies `step(i, state)` for i = 0 to `count` - 1.
+
+    Accelerators get the unrolled steps: in a loop, every carried number would be copied by a kernel
+    of its own. On a CPU a loop compiles faster.
+    """
 
     def looped(state: Any) -> Any:
         return lax.fori_loop(0, count, step, state)
@@ -121,7 +124,7 @@ def _turn(
 ) -> tuple[_Entries, _Entries]:
     """One Jacobi rotation, which makes entry (p, q) zero."""
     off, gap = entries[p, q], entries[q, q] - entries[p, p]
-    # tan of the smaller angle with tan(2 angle) = 2 off / gap
+    # the tangent of the smaller angle that satisfies tan(2 angle) = 2 off / gap
     reach = jnp.abs(gap) + jnp.sqrt(gap * gap + 4 * off * off)
     tangent = 2 * off * jnp.where(gap < 0, -1, 1) / jnp.where(reach > 0, reach, 1)
     cosine = lax.rsqrt(1 + tangent * tangent)
@@ -143,10 +146,11 @@ def _turn(
 
 @jax.custom_jvp
 def least_direction(covariance: Float[Array, "3 3"]) -> Float[Array, " 3"]:
-    """Unit eigenvector of the smallest eigenvalue of a symmetric matrix; its sign is arbitrary.
+    """Unit eigenvector for the smallest eigenvalue of a symmetric matrix; its sign is arbitrary.
 
-    The derivative is zero in the directions that nothing determines: where the two smallest
-    eigenvalues agree to 1e-5 of the largest (a line, a ball), relative, so at every scale.
+    The derivative is zero in undetermined directions: where the two smallest eigenvalues differ by
+    at most 1e-5 of the matrix's largest entry (a line, a ball). The limit is relative, so it holds
+    at every scale.
     """
     values, vectors = symmetric_eigen(_unit_scale(covariance)[0])
     return vectors[:, jnp.argmin(values)]

@@ -1,8 +1,7 @@
-"""Rigid motions on the host: numpy, float64, no gradients. `rigid` has those of the device.
+"""Rigid motions on the host: numpy, float64, no gradients. For the device, see `rigid`.
 
-A motion T is (4, 4) and maps x to R x + t. Applied after another it stands on the left, as in
-`second @ first`. Quaternions are (x, y, z, w), as in scipy; angles are in degrees, rotation vectors
-in radians.
+A motion T is (4, 4) and maps x to R x + t. `second @ first` applies `first`, then `second`.
+Quaternions are (x, y, z, w), as in scipy. Angles are in degrees, rotation vectors in radians.
 """
 
 from __future__ import annotations
@@ -11,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-# How far R R' may be from the identity. Files write rotations with three digits; float32 is off by
-# about 1e-6.
+# How far R R' may be from the identity. Some files store rotations with three digits; float32 alone
+# is off by about 1e-6.
 TOLERANCE = 1e-3
-_LAST_ROW = 1e-6  # a larger entry makes the matrix a projection, which no rounding does
+_LAST_ROW = 1e-6  # a larger deviation makes the matrix a projection, which rounding cannot cause
 
 
 def motion(
@@ -30,19 +29,19 @@ def motion(
 def apply(
     transform: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*n 3"]
 ) -> Float[np.ndarray, "*n 3"]:
-    """Where the points, or one point, lie after the motion."""
+    """Moves points, or a single point."""
     return points @ transform[:3, :3].T + transform[:3, 3]
 
 
 def rotate(
     transform: Float[np.ndarray, "4 4"], vectors: Float[np.ndarray, "*n 3"]
 ) -> Float[np.ndarray, "*n 3"]:
-    """Directions, such as normals, after the motion: turned, not shifted."""
+    """Rotates directions, such as normals, without translating them."""
     return vectors @ transform[:3, :3].T
 
 
 def inverse(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The motion back, (R', -R' t), in the precision of `transform`."""
+    """The inverse motion (R', -R' t), in the precision of `transform`."""
     back = np.eye(4, dtype=transform.dtype)
     back[:3, :3] = transform[:3, :3].T
     back[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
@@ -52,11 +51,11 @@ def inverse(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
 def angle_between(
     first: Float[np.ndarray, "*batch 4 4"], second: Float[np.ndarray, "*batch 4 4"]
 ) -> Float[np.ndarray, "*batch"]:
-    """Angle of the rotation from one motion to the other, in degrees, in [0, 180].
+    """Angle between the rotations of two motions, in degrees, in [0, 180].
 
-    By the chord: |R1 - R2| = sqrt(8) sin(angle / 2). It resolves 1e-14 degrees where the arccos of
-    the trace, which `evaluation.metrics` has as published, stops at 1e-6; near 180 degrees it is
-    good to 1e-6.
+    Computed from the chord: |R1 - R2| = sqrt(8) sin(angle / 2). It resolves 1e-14 degrees. The
+    arccos of the trace, which `evaluation.metrics` uses because it is published that way, stops at
+    1e-6. Near 180 degrees the chord is accurate to 1e-6.
     """
     difference = first[..., :3, :3] - second[..., :3, :3]
     chord = np.linalg.norm(difference, axis=(-2, -1))
@@ -72,14 +71,15 @@ def nearest_rotation(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndar
 
 
 def nearest_motion(transforms: ArrayLike) -> Float[np.ndarray, "*batch 4 4"]:
-    """The same matrices in float64, their (3, 3) parts replaced by the `nearest_rotation`."""
+    """The matrices in float64, with each (3, 3) part replaced by its `nearest_rotation`."""
     made = np.array(transforms, np.float64)
     made[..., :3, :3] = nearest_rotation(made[..., :3, :3])
     return made
 
 
 def are_rigid(transforms: Float[np.ndarray, "*batch 4 4"]) -> Bool[np.ndarray, "*batch"]:
-    """Which are finite, with a proper rotation up to `TOLERANCE` and a last row 0 0 0 1."""
+    """Which matrices are finite, with a rotation that is proper up to `TOLERANCE` and a last row
+    0 0 0 1."""
     finite = np.isfinite(transforms).all(axis=(-2, -1))
     sound = np.where(finite[..., None, None], transforms, 0)
     turns = sound[..., :3, :3]
@@ -92,9 +92,10 @@ def are_rigid(transforms: Float[np.ndarray, "*batch 4 4"]) -> Bool[np.ndarray, "
 def check_rigid(
     name: str, transforms: ArrayLike, *, several: bool = False
 ) -> Float[np.ndarray, "*batch 4 4"]:
-    """One motion, or `several` along leading axes, in float64.
+    """Returns one motion, or `several` along leading axes, as float64.
 
-    Raises ValueError, beginning with `name`, for another shape and where one is not rigid.
+    Raises ValueError, with a message that begins with `name`, if the shape is wrong or a motion is
+    not rigid.
     """
     found = np.asarray(transforms, np.float64)
     if found.shape[-2:] != (4, 4) or (found.ndim > 2 and not several):
@@ -116,7 +117,7 @@ def _fault(transform: Float[np.ndarray, "4 4"]) -> str:
     turn = transform[:3, :3]
     off = np.abs(turn @ turn.T - np.eye(3)).max()
     if off > TOLERANCE:
-        return f"R Rᵀ is {off:.2g} off the identity"
+        return f"R Rᵀ differs from the identity by {off:.2g}"
     if np.linalg.det(turn) < 0:
         return "R is a reflection"
     return f"the last row is {transform[3].tolist()}"
@@ -125,16 +126,16 @@ def _fault(transform: Float[np.ndarray, "4 4"]) -> str:
 def from_quaternion(
     quaternions: Float[np.ndarray, "*batch 4"],
 ) -> Float[np.ndarray, "*batch 3 3"]:
-    """Rotations of quaternions (x, y, z, w) of any length but zero."""
+    """Rotations for quaternions (x, y, z, w) of any nonzero length."""
     x, y, z, w = np.moveaxis(quaternions, -1, 0)
     return _of_unit(quaternions / np.sqrt(x * x + y * y + z * z + w * w)[..., None])
 
 
 def to_quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
-    """Unit quaternion (x, y, z, w), w >= 0, of a rotation, or of what is nearly one.
+    """Unit quaternion (x, y, z, w), w >= 0, of a rotation or of a matrix that is nearly one.
 
-    The eigenvector of the largest eigenvalue of a symmetric matrix linear in the rotation
-    (Bar-Itzhack, 2000).
+    It is the eigenvector for the largest eigenvalue of a symmetric matrix that is linear in the
+    rotation (Bar-Itzhack, 2000).
     """
     (a, b, c), (d, e, f), (g, h, i) = rotation
     symmetric = np.array(
@@ -150,19 +151,19 @@ def to_quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]
 
 
 def from_rotvec(turns: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Rotations about the directions of `turns` by their lengths, in radians."""
+    """Rotations about the directions of `turns`, by angles equal to their lengths in radians."""
     x, y, z = np.moveaxis(turns, -1, 0)
     angle = np.sqrt(x * x + y * y + z * z)[..., None]
     square = angle * angle
     small = angle <= 1e-3
-    # sin(angle / 2) / angle, by its series where the quotient loses digits
+    # sin(angle / 2) / angle; near zero, where the quotient loses digits, from its series
     series = 0.5 - square / 48 + square * square / 3840
     scale = np.where(small, series, np.sin(angle / 2) / np.where(small, 1, angle))
     return _of_unit(np.concatenate([scale * turns, np.cos(angle / 2)], axis=-1))
 
 
 def to_rotvec(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
-    """The way back of `from_rotvec`: a turn by at most half a circle, in radians."""
+    """The inverse of `from_rotvec`: a rotation vector of length at most pi, in radians."""
     *axis, w = to_quaternion(rotation)
     sine = float(np.linalg.norm(axis))
     return np.array(axis) * (2 * np.arctan2(sine, w) / sine if sine else 2.0)
@@ -179,13 +180,13 @@ def _of_unit(quaternions: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*
 
 
 def cover(count: int) -> Float[np.ndarray, "count 3 3"]:
-    """`count` rotations spread evenly over SO(3); the first ones are no cover of their own.
+    """`count` rotations spread evenly over SO(3). A prefix of them is not spread evenly.
 
-    Super-Fibonacci spirals (Alexa, CVPR 2022): quaternion i winds about two circles at angles that
-    advance by 1 / sqrt(2) and by 1 / psi of a turn, psi^4 = psi + 4, while its weight goes evenly
-    from one circle to the other. The farthest that any rotation is from the nearest of them is
-    61 degrees for 64, 46 for 128, 37 for 256 (`tests/geometry/test_motions_cover.py` measures it).
-    Raises ValueError for a count below 1.
+    Super-Fibonacci spirals (Alexa, CVPR 2022): quaternion i winds around two circles, at angles
+    that advance by 1 / sqrt(2) and by 1 / psi of a turn with psi^4 = psi + 4, while its weight
+    moves evenly from one circle to the other. No rotation is farther from its nearest one than
+    61 degrees for 64 rotations, 46 for 128, and 37 for 256 (measured in
+    `tests/geometry/test_motions_cover.py`). Raises ValueError for a count below 1.
     """
     if count < 1:
         raise ValueError(f"count: got {count} rotations, wanted at least 1")

@@ -1,10 +1,10 @@
-"""The K nearest points of each point: exact, self dropped by index, far ones replaced.
+"""The K nearest neighbors of each point: exact, without the point itself, far ones replaced.
 
-Three ways to the same sets. `nearest` is pure JAX, and lowers to one search on CPUs and to another
-on accelerators; `nearest_on_host` is for clouds that are still in host memory. Only the *set* of a
-point's neighbors matters to the network, so none of them promises an order; all break ties by the
-lower index. (Distances that agree to the last bit or two of float32 may fall on either side of the
-K-th place.) Everything downstream takes indices.
+There are three ways to find the same sets. `nearest` is pure JAX and lowers to one search on CPUs
+and another on accelerators. `nearest_on_host` is for clouds that are still in host memory. Only the
+*set* of a point's neighbors matters to the network, so their order is not specified. All three
+break ties in favor of the lower index. (Distances that differ only in the last bit or two of
+float32 may fall on either side of the K-th place.) Everything downstream takes indices.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from jaxtyping import Array, Bool, Float, Int32
 from cfr_jax.geometry.closest import far_where_masked, squares
 from cfr_jax.geometry.selection import k_smallest, k_smallest_of_groups, nth_set_bit, pack
 
-_BLOCK = 1 << 16  # distances held at a time on a CPU: they stay in a core's cache
-# On the host: up to so many points comparing all beats the tree (5 to 13 ms at 1,024 points,
-# 25 to 31 at 2,048), a block of rows at a time.
+_BLOCK = 1 << 16  # distances held at a time on a CPU, so that they stay in a core's cache
+# On the host, up to this many points, comparing all pairs by blocks of rows is faster than the tree
+# (1,024 points: 5 ms, the tree 13 ms; 2,048 points: 25 and 31 ms).
 _FEW = 1536
 _HOST_ROWS = 64
 _TREE_ROWS = 1 << 13
@@ -36,17 +36,18 @@ def nearest(
 ) -> Int32[Array, "n k"]:
     """Indices of the `k` nearest other points of each point.
 
-    A neighbor further than `radius` is replaced by the nearest one, which is kept even when it lies
-    outside. Points where `mask` is false are nobody's neighbor; a cloud with fewer than k + 1 valid
-    points repeats its nearest ones in the same way. Needs 1 <= k <= n - 1. Not differentiable
-    (indices). Memory grows with n, not with n^2: rows are done in blocks.
+    A neighbor farther away than `radius` is replaced by the nearest one, which is kept even if it
+    lies outside. Points where `mask` is false are never neighbors. If a cloud has fewer than k + 1
+    valid points, the nearest one is repeated in the same way. Indices have no gradient. Memory
+    grows with n, not with n^2, because rows are processed in blocks. Raises ValueError unless
+    1 <= k <= n - 1.
     """
     n = points.shape[0]
     if not 1 <= k <= n - 1:
         raise ValueError(
             f"k: got {k} neighbors for a cloud of {n} points, wanted 1 <= k <= {n - 1}"
         )
-    points = points.astype(jnp.float32)  # as the host measures; the search works on its bits
+    points = points.astype(jnp.float32)  # as on the host; the search works on the bits of float32
     limit = jnp.inf if radius is None else radius * radius
     return lax.platform_dependent(
         points,
@@ -59,7 +60,7 @@ def nearest(
 def _nearest_by_bits(
     points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None, k: int, limit: float
 ) -> Int32[Array, "n k"]:
-    """`nearest` as a CPU does it."""
+    """`nearest` on a CPU."""
     n = points.shape[0]
 
     def choose(row: Array, square: Array) -> Array:
@@ -78,7 +79,7 @@ def _nearest_by_bits(
 def _nearest_by_groups(
     points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None, k: int, limit: float, **sizes: int
 ) -> Int32[Array, "n k"]:
-    """`nearest` as an accelerator does it: a handful of kernels."""
+    """`nearest` on an accelerator, in a handful of kernels."""
 
     def square_of(row: Array, query: Array, column: Array, point: Array) -> Array:
         return jnp.where(row == column, jnp.inf, squares(query, point))
@@ -92,9 +93,10 @@ def _nearest_by_groups(
 def first_in_ball(
     points: Float[Array, "n 3"], k: int, radius: float, mask: Bool[Array, " n"] | None = None
 ) -> Int32[Array, "n k"]:
-    """The first `k` other valid points, by index, within `radius` of each; what is missing, itself.
+    """For each point, the first `k` other valid points, by index, that lie within `radius` of it.
 
-    RPM-Net's neighborhoods: not the nearest, and with repeated centers where a ball is sparse. A
+    If there are fewer, the point itself fills the missing places. These are RPM-Net's
+    neighborhoods: not the nearest points, and with a repeated center where a ball is sparse. A
     rigid motion does not change them.
     """
     return lax.platform_dependent(
@@ -137,8 +139,11 @@ def _first_by_groups(
 def _by_rows(
     points: Float[Array, "n 3"], choose: Callable[[Array, Array], Array]
 ) -> Int32[Array, "n k"]:
-    """`choose(row, square)` for blocks of rows: their numbers (r, 1) and their squared distances to
-    all points (r, n) in, their neighbors (r, k) out; all rows (n, k) back."""
+    """Calls `choose(row, square)` on blocks of r rows and joins the results to (n, k).
+
+    `row` (r, 1) has the rows' indices and `square` (r, n) their squared distances to all points.
+    `choose` returns their neighbors (r, k).
+    """
     n = points.shape[0]
     rows = max(1, min(n, _BLOCK // n))
     blocks = -(-n // rows)
@@ -156,12 +161,13 @@ def _by_rows(
 def nearest_on_host(
     points: np.ndarray, k: int, *, radius: float | None = None, workers: int = 1
 ) -> np.ndarray:
-    """`nearest` for an (n, 3) cloud in host memory; (n, k) int32.
+    """`nearest` for an (n, 3) cloud in host memory; returns (n, k) int32.
 
-    Up to a thousand points or so it compares all of them, beyond that it asks a KD-tree, with
-    `workers` threads. The tree measures in float64, the network in float32: a few more neighbors
-    than wanted are asked for and measured again in float32, so that ties fall as they do on the
-    device. (Only where more than a few hundred points tie does the tree choose among them.)
+    For small clouds (up to 1,536 points) it compares all pairs. For larger ones it uses a KD-tree
+    with `workers` threads. The tree measures in float64, the network in float32. So the tree
+    returns a few more neighbors than wanted, and these are measured again in float32, which breaks
+    ties as on the device. (Only if more than a few hundred points tie does the tree choose among
+    them.)
     """
     points = np.asarray(points, np.float32)
     n = len(points)
@@ -179,7 +185,7 @@ def nearest_on_host(
 
 
 def _among_all(points: np.ndarray, k: int) -> np.ndarray:
-    """Keys of the k nearest other points of each point, by comparing all."""
+    """Keys of the k nearest other points of each point, by comparing all pairs."""
     n = len(points)
     columns, index = np.ascontiguousarray(points.T), np.arange(n)
     blocks = []
@@ -192,15 +198,15 @@ def _among_all(points: np.ndarray, k: int) -> np.ndarray:
 
 
 def _in_tree(points: np.ndarray, k: int, workers: int) -> np.ndarray:
-    """The same by a KD-tree, some rows at a time: what it finds is many times what is kept."""
+    """The same from a KD-tree, in blocks of rows, because it returns many more than are kept."""
     n = len(points)
-    # imported here: a fifth of a second that small clouds need not wait for
+    # imported here because it takes a fifth of a second, which small clouds do not need
     from scipy.spatial import cKDTree
 
     tree = cKDTree(points)
     keys = np.empty((n, k), np.int64)
     for rows in np.array_split(np.arange(n), -(-n // _TREE_ROWS)):
-        for more in (8, 256):  # on a lattice the few are not enough
+        for more in (8, 256):  # on a lattice, 8 more are not enough
             wide = min(n, k + more)
             near = tree.query(points[rows], wide, workers=workers)[1].reshape(len(rows), wide)
             offset = points[near] - points[rows, None]
@@ -214,10 +220,11 @@ def _in_tree(points: np.ndarray, k: int, workers: int) -> np.ndarray:
 
 
 def _smallest(square: np.ndarray, index: np.ndarray, k: int) -> np.ndarray:
-    """Keys of each row's k smallest distances, in no order.
+    """Keys of each row's k smallest distances, in no particular order.
 
-    A key is the distance's bits, monotonic as none is negative, above the point's index: ties fall
-    to the lower index, and numpy partitions whole numbers by vector instructions.
+    A key holds the bits of the distance in its upper half and the point's index in its lower half.
+    The bits are monotonic because no distance is negative. So ties go to the lower index, and numpy
+    partitions integers with vector instructions.
     """
     keys = square.view(np.int32).astype(np.int64) << 32 | index
     keys.partition(k - 1, axis=1)

@@ -1,11 +1,11 @@
 """Rigid motions of 3D space: fitting, composing, and measuring them.
 
-A motion is a (4, 4) matrix `T` acting on column vectors, `T @ [x; 1]`, and is named by what it
-does: `transform` maps source onto target. Twists are (6,) vectors, rotation vector first, then the
-translation part, with `exp` the matrix exponential of SE(3) (Murray, Li & Sastry, 1994, ch. 2).
+A motion is a (4, 4) matrix `T` acting on column vectors, `T @ [x; 1]`. Its name says what it does:
+`transform` maps source onto target. Twists are (6,) vectors: the rotation vector, then the
+translation part. `exp` is the matrix exponential of SE(3) (Murray, Li & Sastry, 1994, ch. 2).
 
-Everything here states full float32 precision for its products: on accelerators that would otherwise
-round them (TF32, bfloat16) a rotation loses three digits.
+All products here ask for full float32 precision. Otherwise accelerators would round their inputs
+(TF32, bfloat16), and a rotation would lose three digits.
 """
 
 from __future__ import annotations
@@ -29,41 +29,41 @@ def from_parts(
 
 
 def apply(transform: Float[Array, "4 4"], points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Moves points; for directions such as normals use `rotate`."""
+    """Moves points. For directions, such as normals, use `rotate`."""
     return rotate(transform, points) + transform[:3, 3]
 
 
 def rotate(transform: Float[Array, "4 4"], vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Turns directions: the rotation of `transform` without its translation."""
+    """Rotates directions: applies the rotation of `transform` without its translation."""
     return jnp.matmul(vectors, transform[:3, :3].T, precision=_HIGHEST)
 
 
 def compose(second: Float[Array, "4 4"], first: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
-    """The motion that does `first`, then `second`."""
+    """The motion that applies `first`, then `second`."""
     return jnp.matmul(second, first, precision=_HIGHEST)
 
 
 def invert(transform: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
-    """The motion back; exact for rigid motions, wrong for anything else."""
+    """The inverse motion; exact for rigid motions, wrong for any other matrix."""
     back = transform[:3, :3].T
     return from_parts(back, -jnp.matmul(back, transform[:3, 3], precision=_HIGHEST))
 
 
-@jax.jit  # so that it is traced once and not in every iteration
+@jax.jit  # so that it is traced once, not in every iteration
 def fit_rigid(
     source: Float[Array, "n 3"], target: Float[Array, "n 3"], weights: Float[Array, " n"]
 ) -> Float[Array, "4 4"]:
-    """Rigid motion carrying `source` onto `target`, row by row.
+    """Rigid motion that maps `source` onto `target`, row by row.
 
-    Minimizes sum_n weights_n |R source_n + t - target_n|^2 (Kabsch, 1976; Umeyama, 1991) with the
-    weights normalized by their sum + 1e-5, as the paper does. Weights are non-negative; the
-    rotation is proper. Where the minimizer is not unique (collinear or identical points, zero
-    weights) the answer is one of them, and the gradient is zero in the directions that nothing
-    determines.
+    Minimizes sum_n weights_n |R source_n + t - target_n|^2 (Kabsch, 1976; Umeyama, 1991). The
+    weights are divided by their sum + 1e-5, as in the paper. They must be non-negative. The
+    rotation is proper. If the minimizer is not unique (collinear or identical points, zero
+    weights), the result is one of the minimizers, and the gradient is zero in the directions that
+    are not determined.
     """
     weights = weights / (jnp.sum(weights) + 1e-5)
-    # The rotation does not change with the scale of either cloud: bringing both to about one keeps
-    # the covariance inside float32 for clouds of any size, and needs no gradient.
+    # The rotation does not depend on the scale of either cloud. Scaling both to about one keeps the
+    # covariance within float32's range for clouds of any size, and needs no gradient.
     size_source, size_target = (
         lax.stop_gradient(jnp.max(jnp.abs(cloud), initial=jnp.finfo(cloud.dtype).tiny))
         for cloud in (source, target)
@@ -85,14 +85,14 @@ def fit_rigid(
 def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """The proper rotation R that maximizes trace(R^T matrix).
 
-    Horn (1987): the quaternion of R is the leading eigenvector of a symmetric 4x4 matrix linear in
-    `matrix`. Reflections need no case of their own, and no step divides by a singular value: every
-    finite matrix has an answer (zero gives the identity).
+    Horn (1987): the quaternion of R is the leading eigenvector of a symmetric 4x4 matrix that is
+    linear in `matrix`. Reflections need no special case, and no step divides by a singular value,
+    so every finite matrix has a result (zero gives the identity).
 
     The derivative does not pass through the eigenvectors. With P = R^T matrix (symmetric at the
     optimum), dR = R [w]x where (tr(P) I - P) w = vee(R^T dmatrix - dmatrix^T R). That system is
-    singular just where R is not unique; there its pseudo-inverse is used, with a threshold relative
-    to the largest singular value, so that the gradient stays finite at every scale.
+    singular exactly where R is not unique. There its pseudo-inverse is used, with a relative
+    threshold, so that the gradient stays finite at every scale.
     """
     largest = jnp.max(jnp.abs(matrix))
     xx, xy, xz, yx, yy, yz, zx, zy, zz = (matrix / jnp.where(largest > 0, largest, 1)).reshape(9)
@@ -127,7 +127,7 @@ def _nearest_rotation_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tupl
 
 
 def from_quaternion(quaternion: Float[Array, " 4"]) -> Float[Array, "3 3"]:
-    """Rotation of a quaternion (w, x, y, z) of any non-zero length."""
+    """Rotation for a quaternion (w, x, y, z) of any nonzero length."""
     w, x, y, z = quaternion * lax.rsqrt(jnp.sum(quaternion * quaternion))
     return jnp.array(
         [
@@ -150,10 +150,10 @@ def _vee(matrix: Float[Array, "3 3"]) -> Float[Array, " 3"]:
 
 
 def exp(twist: Float[Array, " 6"]) -> Float[Array, "4 4"]:
-    """The motion of a twist (rotation vector, translation part); differentiable at zero."""
+    """The motion for a twist (rotation vector, translation part); differentiable at zero."""
     turn, slide = twist[:3], twist[3:]
     square = jnp.sum(turn * turn)
-    small = square < 1e-4  # the series' next terms are below float32 there
+    small = square < 1e-4  # here the next terms of the series are below float32's resolution
     safe = jnp.where(small, 1, square)
     angle = jnp.sqrt(safe)
     a = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
@@ -168,7 +168,7 @@ def exp(twist: Float[Array, " 6"]) -> Float[Array, "4 4"]:
 
 
 def log(transform: Float[Array, "4 4"]) -> Float[Array, " 6"]:
-    """The twist of a motion, its rotation vector no longer than pi: the inverse of `exp`."""
+    """The inverse of `exp`: the twist of a motion, with a rotation vector of length at most pi."""
     quaternion = to_quaternion(transform[:3, :3])
     w, axis = quaternion[0], quaternion[1:]
     square = jnp.sum(axis * axis)
@@ -189,7 +189,7 @@ def log(transform: Float[Array, "4 4"]) -> Float[Array, " 6"]:
 def to_quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, " 4"]:
     """Unit quaternion (w, x, y, z), w >= 0, of a rotation (Shepperd, 1978: largest part first)."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
-    # each row is 4 q_k q: all four are parallel, and the longest is the best conditioned
+    # Row k is 4 q_k q, so all four rows are parallel. The longest is the best conditioned.
     rows = jnp.array(
         [
             [1 + a + e + i, h - f, c - g, d - b],
@@ -206,8 +206,8 @@ def to_quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, " 4"]:
 def rotation_error(transform: Float[Array, "4 4"], truth: Float[Array, "4 4"]) -> Float[Array, ""]:
     """Angle in degrees between the rotations of two motions.
 
-    By the chord |R - R_truth|, accurate down to float32's 1e-5 degrees, where the usual arccos of
-    the trace loses everything below 0.03 degrees.
+    Computed from the chord |R - R_truth|, which is accurate down to float32's 1e-5 degrees. The
+    usual arccos of the trace cannot resolve angles below 0.03 degrees.
     """
     chord = jnp.sum((transform[:3, :3] - truth[:3, :3]) ** 2)
     half_sine = jnp.sqrt(jnp.where(chord > 0, chord / 8, 0))
@@ -219,5 +219,5 @@ def translation_error(
 ) -> Float[Array, ""]:
     """Length of the translation of truth^-1 o transform, in the clouds' unit."""
     square = jnp.sum((transform[:3, 3] - truth[:3, 3]) ** 2)
-    apart = square > 0  # the derivative used at zero is zero
+    apart = square > 0  # at zero, the derivative is defined as zero
     return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)

@@ -1,6 +1,6 @@
-"""The k smallest of each row, exact and with ties in order.
+"""The k smallest values of each row: exact, with ties broken by order.
 
-By vector arithmetic on bits for CPUs, where sorting is slow; by sorting little for accelerators.
+CPUs, where sorting is slow, use vector arithmetic on bits. Accelerators sort, but few values.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ _WORD = 32
 
 
 def k_smallest(values: Float[Array, "r n"], k: int) -> Int32[Array, "r k"]:
-    """Columns of each row's k smallest non-negative values, in the order of the columns.
+    """Columns of each row's k smallest values, in column order. All values must be non-negative.
 
     Bisection on the bits finds the k-th smallest value, and counting bits in packed words finds the
-    columns below it: plain vector arithmetic throughout. Of 717 points with k = 64 on two cores it
-    took 6.4 ms, XLA's `top_k` 9.6 ms (2,048 points: 31 and 44 ms), and ties have an order.
+    columns up to it. All of this is plain vector arithmetic. For 717 points with k = 64 on two
+    cores it took 6.4 ms and XLA's `top_k` 9.6 ms (2,048 points: 31 and 44 ms). Ties go to the lower
+    column.
     """
     n = values.shape[1]
-    bits = lax.bitcast_convert_type(values, jnp.int32)  # monotonic, as no value is negative
+    bits = lax.bitcast_convert_type(values, jnp.int32)  # monotonic because no value is negative
 
     def halve(_: Any, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds
@@ -36,7 +37,7 @@ def k_smallest(values: Float[Array, "r n"], k: int) -> Int32[Array, "r k"]:
     kth, _ = lax.fori_loop(0, 31, halve, (low, jnp.max(bits, axis=1)))
     below, equal = bits < kth[:, None], bits == kth[:, None]
     spare = k - jnp.sum(below, axis=1)
-    # of the values tied at the k-th place only the first `spare` columns are taken
+    # among the values that tie for the k-th place, only the first `spare` columns are taken
     words_equal = pack(equal)
     last_equal = nth_set_bit(words_equal, spare[:, None] - 1)
     taken = below | (equal & (jnp.arange(n) <= last_equal))
@@ -52,18 +53,19 @@ def k_smallest_of_groups(
     few: int = 512,
     entries: int = 1 << 26,
 ) -> tuple[Float[Array, "n k"], Int32[Array, "n k"]]:
-    """The k smallest of each query's values over all points, rising, and the points' numbers.
+    """Each query's k smallest values over all points, ascending, and the indices of those points.
 
-    `value_of(row, query, column, point)` is a value: of numbers (r, 1), coordinates (r, 1, 3),
-    numbers (r or 1, c), coordinates (r or 1, c, 3) it makes values (r, c), infinite for points at
-    infinity. It is asked twice. First the points are taken in groups, and only the least value of
-    each group is stored: the k smallest values lie in the k groups whose least is smallest. Then
-    those groups are looked at point by point. With groups of sqrt(m / k) points 2 sqrt(m k) values
-    are sorted instead of m: at 12,000 points and k = 64 a seventh. Ties go to the lower number in
-    both rounds, for the groups are runs of points and stay in order.
+    `value_of(row, query, column, point)` computes the values (r, c) from the queries' indices
+    (r, 1) and coordinates (r, 1, 3) and the points' indices (r or 1, c) and coordinates
+    (r or 1, c, 3). It must be infinite for points at infinity. It is called twice. First the points
+    are taken in groups, and only the smallest value of each group is stored: the k smallest values
+    lie in the k groups with the smallest minima. Then the points of those groups are examined one
+    by one. With groups of sqrt(m / k) points, 2 sqrt(m k) values are sorted instead of m, which is
+    a seventh for 12,000 points and k = 64. Ties go to the lower index in both rounds, because
+    groups are runs of points and stay in order.
 
-    Up to `few` points are sorted as they are; queries come in blocks that sort `entries` values at
-    a time, 256 MiB of float32, and no block stores all distances.
+    With at most `few` points, all values are sorted without groups. Queries are processed in blocks
+    that sort `entries` values at a time (256 MiB of float32), and no block stores all distances.
     """
     n, m = queries.shape[0], points.shape[0]
     size = 1 if m <= few else 1 << round(math.log2(m / k) / 2)
@@ -98,7 +100,7 @@ def k_smallest_of_groups(
 
 
 def pack(flags: Bool[Array, "r n"]) -> Array:
-    """Rows of flags as rows of 32-bit words, lowest bit first."""
+    """Packs rows of flags into rows of 32-bit words, lowest bit first."""
     rows, n = flags.shape
     padded = jnp.pad(flags, ((0, 0), (0, -n % _WORD))).reshape(rows, -1, _WORD)
     return jnp.sum(padded.astype(jnp.uint32) << jnp.arange(_WORD, dtype=jnp.uint32), axis=-1)
@@ -108,7 +110,7 @@ def nth_set_bit(words: Array, rank: Array) -> Int32[Array, "r k"]:
     """Position of the set bit number `rank` (from 0) in each row of packed words."""
     rank = rank.astype(jnp.int32)
     upto = jnp.cumsum(lax.population_count(words).astype(jnp.int32), axis=1)
-    # the word that holds it: as many words end before it as have no more bits than its rank
+    # The word with that bit: its index is the number of words whose running count is <= the rank.
     word = jnp.sum(upto[:, None, :] <= rank[:, :, None], axis=2, dtype=jnp.int32)
     word = jnp.minimum(word, words.shape[1] - 1)
     content = jnp.take_along_axis(words, word, axis=1)

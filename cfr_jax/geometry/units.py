@@ -1,7 +1,8 @@
 """From a user's clouds to the network's, and back: frame, scale, budget, normals, padding.
 
-Host side, float64: at map coordinates (5e6 m) float32 resolves half a meter, so everything that
-involves the caller's frame happens here, and the device sees centered clouds of unit size only.
+This runs on the host in float64. At map coordinates (5e6 m) float32 resolves half a meter, so
+everything in the caller's frame is computed here. The device only sees centered clouds of unit
+size.
 """
 
 from __future__ import annotations
@@ -15,34 +16,35 @@ from cfr_jax.geometry import motions
 from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.io import PointCloud
 
-# Sizes that clouds are padded to, so that a new cloud rarely means a new compilation. Steps of a
-# third waste little; a cloud below the smallest is compiled as it is.
+# Sizes that clouds are padded to, so that a new cloud rarely needs a new compilation. Steps of
+# about a third waste little.
 _BUCKETS = tuple(
     size
     for power in range(7, 21)
     for size in (2**power, 2**power * 4 // 3 // 32 * 32, 2**power * 5 // 3 // 32 * 32)
 )
-_OUTER = 0.995  # this share of the points lies in the unit sphere; stray ones may lie outside
-_STRAY = 4.0  # points so far out are errors of the sensor, and would drown the network
-FARTHEST = 1e3  # radii between the clouds: float32 holds that with digits to spare
+_OUTER = 0.995  # this share of the points lies in the unit sphere; stray points may lie outside
+_STRAY = 4.0  # points farther out are sensor errors and would dominate the network's input
+FARTHEST = 1e3  # largest distance between the clouds, in radii; float32 resolves it with ease
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Where the unit-size clouds lie in the caller's coordinates: x = center + scale * unit."""
+    """Maps unit-size clouds to the caller's coordinates: x = center + scale * unit."""
 
     source_center: Float[np.ndarray, " 3"]
     target_center: Float[np.ndarray, " 3"]
     scale: float
     initial: Float[np.ndarray, "4 4"]
-    """Moves the caller's source before it is centered."""
+    """Applied to the caller's source before it is centered."""
     size_ratio: float = 1.0
-    """Radius of the source over that of the target."""
+    """Radius of the source divided by the radius of the target."""
 
     def to_caller(self, transforms: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
-        """Motions between the unit clouds as motions of the caller's source onto the target."""
+        """Converts motions between the unit clouds to motions of the caller's source onto the
+        target."""
         transforms = np.asarray(transforms, np.float64)
-        # float32's 1e-7 would show at a million meters
+        # float32's error of 1e-7 would be visible at a million meters
         rotation = motions.nearest_rotation(transforms[..., :3, :3])
         # rotate about the source's center, so that large coordinates never multiply float32's error
         shift = (
@@ -51,7 +53,7 @@ class Frames:
         return motions.motion(rotation, shift) @ self.initial
 
     def to_unit(self, transforms: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
-        """The other way: motions of the caller's source as motions between the unit clouds."""
+        """Converts motions of the caller's source to motions between the unit clouds."""
         transforms = np.asarray(transforms, np.float64) @ np.linalg.inv(self.initial)
         turns = transforms[..., :3, :3]
         place = turns @ self.source_center + transforms[..., :3, 3]
@@ -61,14 +63,14 @@ class Frames:
 
 @dataclass(frozen=True)
 class UnitCloud:
-    """A cloud ready for the device: unit size, within budget, padded to a bucket."""
+    """A cloud ready for the device: of unit size, within the budget, padded to a bucket."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"] | None
     neighbors: Int[np.ndarray, "n k"]
     mask: Bool[np.ndarray, " n"]
     rows: Int[np.ndarray, " used"]
-    """Which of the caller's points these are, in order; the padding follows them."""
+    """Indices of the used points among the caller's, in order. The padding follows the points."""
 
 
 def unit_frames(
@@ -76,9 +78,9 @@ def unit_frames(
 ) -> Frames:
     """Centers and a common scale that bring both clouds into the unit sphere.
 
-    Without an initial motion each cloud is centered at its own centroid: any offset between them is
-    taken out. With one, both keep their places relative to the target's centroid. Raises ValueError
-    for clouds without extent, and for an initial motion that leaves them far apart.
+    Without an initial motion, each cloud is centered at its own centroid, which removes any offset
+    between them. With one, both are placed relative to the target's centroid. Raises ValueError for
+    a cloud without extent and for an initial motion that leaves the clouds far apart.
     """
     (source_center, source_radius), (target_center, target_radius) = (
         _ball(name, cloud.points) for name, cloud in (("source", source), ("target", target))
@@ -93,8 +95,8 @@ def unit_frames(
             f"initial: leaves the source {away:.3g} away from the target, wanted at most "
             f"{FARTHEST * scale:.3g}, which is {FARTHEST:g} times the radius of the clouds"
         )
-    # What is off by rounding is made a rotation, about the source's center: far from the origin
-    # the slightest turn about that would move the cloud.
+    # The initial rotation may be off by rounding, so the nearest proper one is used. It is applied
+    # about the source's center: about a distant origin, the slightest turn would move the cloud.
     turn = motions.nearest_rotation(initial[:3, :3])
     exact = motions.motion(turn, place - turn @ source_center)
     return Frames(target_center, target_center, scale, exact, ratio)
@@ -111,9 +113,9 @@ def to_unit(
     radius: float,
     seed: int,
 ) -> UnitCloud:
-    """At most `budget` points of `cloud`, moved, centered, scaled; with neighbors and padding.
+    """At most `budget` points of `cloud`, moved, centered and scaled, with neighbors and padding.
 
-    Stray points, more than four radii out, are left out.
+    Stray points, more than four radii from the median, are left out.
     """
     points = (motions.apply(motion, cloud.points) - center) / scale
     near = np.linalg.norm(points - np.median(points, axis=0), axis=1) <= _STRAY
@@ -132,7 +134,7 @@ def to_unit(
 
 
 def thinned(unit: UnitCloud, *, budget: int, neighbors: int, radius: float, seed: int) -> UnitCloud:
-    """At most `budget` points of a unit cloud, where they lie; its `rows` are those of `unit`."""
+    """At most `budget` points of a unit cloud, in place; `rows` index the points of `unit`."""
     normals = None if unit.normals is None else unit.normals[unit.mask].astype(np.float64)
     cloud = PointCloud(unit.points[unit.mask].astype(np.float64), normals)
     return to_unit(
@@ -148,19 +150,19 @@ def thinned(unit: UnitCloud, *, budget: int, neighbors: int, radius: float, seed
 
 
 def subsample(points: Float[np.ndarray, "n 3"], budget: int, seed: int) -> Int[np.ndarray, " m"]:
-    """Rows of at most `budget` points, evenly spread: one at random of each voxel of a grid.
+    """Rows of at most `budget` points, evenly spread: a random one from each voxel of a grid.
 
-    The grid is the coarsest of a bisection that fills no fewer voxels than wanted; what is too many
-    is dropped at random. Where the points lie in fewer places than that, all are drawn at random.
-    The same seed gives the same rows.
+    Bisection finds the coarsest grid that still fills at least `budget` voxels; surplus points are
+    dropped at random. If no grid fills that many, because points coincide, the rows are drawn at
+    random. The same seed gives the same rows.
     """
     n = len(points)
     if n <= budget:
         return np.arange(n)
     rng = np.random.default_rng(seed)
-    order = rng.permutation(n)[: 32 * budget]  # enough to find the voxels; bounds the time
+    order = rng.permutation(n)[: 32 * budget]  # enough to find the voxels, and bounds the time
     shuffled = points[order] - np.median(points[order], axis=0)
-    # stray points would stretch the grid: they share its outermost voxels
+    # stray points would stretch the grid, so they are moved into its outermost voxels
     reach = float(np.quantile(np.abs(shuffled).max(axis=1), _OUTER))
     reach = max(reach, np.finfo(np.float64).tiny)
     shuffled = np.clip(shuffled, -reach, reach)
@@ -182,7 +184,7 @@ def bucket(count: int) -> int:
 
 
 def _ball(name: str, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Center and radius of all but the stray points; far ones would pull a plain mean away."""
+    """Center and radius of a cloud without its stray points, which would pull a plain mean away."""
     center = points.mean(axis=0)
     away = np.linalg.norm(points - center, axis=1)
     center = points[away <= np.quantile(away, _OUTER, method="higher")].mean(axis=0)
@@ -196,8 +198,8 @@ def _ball(name: str, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray
 
 
 def _first_of_each_voxel(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray, " m"]:
-    # the middle of a voxel lies at zero, as coordinates of flat and symmetric clouds often do:
-    # a border there would let rounding decide
+    # A voxel is centered at zero, because flat and symmetric clouds often have coordinates there. A
+    # voxel border at zero would let rounding decide.
     cells = np.floor(points / voxel + 0.5).astype(np.int64)
     cells -= cells.min(axis=0)
     extent = cells.max(axis=0) + 1

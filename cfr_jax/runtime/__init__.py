@@ -1,1 +1,1 @@
-"""What the rooms above stand on: atomic files, progress, compiled programs, optional libraries."""
+"""Used by all other folders: atomic files, progress, compiled programs, optional libraries."""

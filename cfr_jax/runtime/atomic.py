@@ -9,10 +9,13 @@ from pathlib import Path
 
 @contextmanager
 def unfinished(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A name beside `path` to write to; it becomes `path` once the block ends without an error, so
-    that no reader sees half a file."""
+    """Yields a temporary path in the same folder to write to.
+
+    When the block ends without an error, the file is renamed to `path`, so no reader ever sees half
+    a file. After an error it is deleted.
+    """
     path = Path(path)
-    # no process number: processes on several machines may share a folder
+    # not the process number: processes on several machines may share a folder
     beside = path.with_name(f".{uuid.uuid4().hex}.tmp")
     try:
         yield beside

@@ -1,4 +1,4 @@
-"""Checks the types of a dataclass that a config file and flags fill in."""
+"""Type checks for a dataclass that is filled in from a config file and flags."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ _WORDS = {
 
 
 def check_types(record: Any, where: str = "") -> None:
-    """Raises ValueError for a field of a dataclass whose value is not of its type.
+    """Raises ValueError if the value of a dataclass field does not have the field's type.
 
-    The annotations must be types, not texts. Of a tuple or a dict only the container is checked; a
-    whole number is a number. `where` stands before the name of the field in the message.
+    The annotations must be types, not strings. For a tuple or a dict, only the container is
+    checked. An int is accepted where a float is wanted. `where` is put before the field's name in
+    the message.
     """
     for each in fields(record):
         value = getattr(record, each.name)

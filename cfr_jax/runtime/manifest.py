@@ -1,6 +1,6 @@
-"""SHA-256 of every file of a folder, so that a flipped bit or a lost file is seen and named.
+"""The SHA-256 of every file in a folder, so that a flipped bit or a lost file is noticed and named.
 
-Orbax reads an array file with a flipped bit as if nothing had happened.
+Orbax alone reads an array file with a flipped bit as if nothing had happened.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ NAME = "manifest.json"
 
 
 class Damaged(ValueError):
-    """A folder whose content is not what was written; says which file."""
+    """The content of a folder is not what was written. The message names the file."""
 
 
 def write(folder: Path) -> None:
-    """Writes the manifest of all that is in `folder` now."""
+    """Writes the manifest of everything that is in `folder` now."""
     (folder / NAME).write_bytes(_text(_files(folder)))
 
 
 def verify(folder: Path) -> None:
-    """Raises `Damaged` unless `folder` holds what its manifest says, no less and no more."""
+    """Raises `Damaged` unless `folder` holds exactly what its manifest says."""
     try:
         told, found = (folder / NAME).read_bytes(), _files(folder)
     except FileNotFoundError as error:
@@ -33,7 +33,7 @@ def verify(folder: Path) -> None:
         wanted = json.loads(told)["files"]
     except (ValueError, KeyError, TypeError) as error:
         raise Damaged(f"{folder / NAME} cannot be read") from error
-    # byte by byte: what a flipped bit leaves readable is damage, too
+    # Compared byte by byte: a flipped bit may leave valid JSON, and that is damage, too.
     if not isinstance(wanted, dict) or told != _text(wanted):
         raise Damaged(f"{folder / NAME} is not as it was written")
     for name in sorted(wanted.keys() | found.keys()):

@@ -6,12 +6,15 @@ import importlib
 from types import ModuleType
 
 _WAY_OUT = 'pip install "cfr_jax[baselines]"'
-# Open3D's wheel leaves its system libraries to the system.
+# Open3D's wheel does not include the system libraries that it needs.
 _SYSTEM = "on Debian or Ubuntu also: apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6"
 
 
 def require(module: str) -> ModuleType:
-    """The module, or a ModuleNotFoundError of one line that says how to get it."""
+    """Imports and returns the module.
+
+    Raises ModuleNotFoundError, in one line that says how to install it.
+    """
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -1,10 +1,10 @@
-"""Programs compiled for arguments of given sizes, and kept between processes as they were lowered.
+"""Compiles programs for given argument sizes, and keeps lowered programs between processes.
 
-JAX's compilation cache is asked with a lowered program, and to trace and lower one takes longer
-than to load and run it. So where there is a folder for them (`keep_in`), lowered programs are kept
-as well, as `jax.export` writes them: StableHLO, nothing that could be run while it is read.
-Whatever could change a program is part of its name: the sources of this package, the versions of
-JAX, its options as far as the environment sets them, the sizes of the arguments.
+JAX's compilation cache looks up a lowered program, but tracing and lowering take longer than
+loading and running. So lowered programs are kept as well, if `keep_in` names a folder for them.
+They are stored in the format of `jax.export`: StableHLO, so reading one runs no code.
+Everything that could change a program is part of its file name: the sources of this package, the
+versions of JAX, its options that the environment sets, and the sizes of the arguments.
 """
 
 from __future__ import annotations
@@ -26,18 +26,20 @@ from jax import export as jax_export
 from cfr_jax.runtime.atomic import write_atomically
 
 _SHA256 = 32  # bytes, in front of each file
-_UNUSED = 30 * 24 * 3600.0  # seconds after which a program is thrown away
-_places: list[Path] = []  # where programs are kept; empty: nowhere
+_UNUSED = 30 * 24 * 3600.0  # seconds without use after which a program is deleted
+_places: list[Path] = []  # the folder that programs are kept in; empty means none
 
 
 def keep_in(folder: Path) -> None:
-    """From now on, lowered programs are kept in `folder`, a month after they were last used. Where
-    nothing can be written, they are traced again, and nothing else happens."""
+    """From now on, keeps lowered programs in `folder` until they have not been used for a month.
+
+    If the folder cannot be written, programs are traced again in each process, without an error.
+    """
     _places[:] = [folder / _versions()]
 
 
 def storable(*nodes: type) -> None:
-    """Says that programs can be kept that take or answer these dataclasses of arrays."""
+    """Registers dataclasses of arrays, so that programs that take or return them can be kept."""
     for node in nodes:
         jax_export.register_pytree_node_serialization(
             node,
@@ -48,8 +50,10 @@ def storable(*nodes: type) -> None:
 
 
 def storable_static(node: type, write: Callable[[Any], str], read: Callable[[str], Any]) -> None:
-    """The same for a class that is static (`jax.tree_util.register_static`), by what makes a text
-    of one and one of a text."""
+    """`storable` for a static class (`jax.tree_util.register_static`).
+
+    `write` turns an instance into a string, and `read` turns the string back into an instance.
+    """
     jax_export.register_pytree_node_serialization(
         node,
         serialized_name=f"{node.__module__}.{node.__qualname__}",
@@ -59,8 +63,10 @@ def storable_static(node: type, write: Callable[[Any], str], read: Callable[[str
 
 
 def compiled(function: Callable, *arguments: Any, **static: Any) -> Callable:
-    """The compiled program of a jitted function for arguments of these sizes, made once, so that
-    compiling can be timed apart from running."""
+    """The compiled program of a jitted function for arguments of these shapes and types.
+
+    It is made once per combination. With it, compiling can be timed separately from running.
+    """
     leaves, structure = jax.tree.flatten(arguments)
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
     return _program(function, tuple(static.items()), structure, shapes)
@@ -74,7 +80,8 @@ def _program(
     shapes: tuple[tuple[tuple[int, ...], Any], ...],
 ) -> jax.stages.Compiled:
     arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    # two lambdas have one name, and so have functions among the options whose code may change
+    # Lambdas, and functions among the options, cannot be told apart by name, so their programs are
+    # not kept.
     if _places and "<" not in f"{function.__qualname__}{static}":
         name = _digest(function.__module__, function.__qualname__, static, structure, shapes)
         path = _places[0] / f"{function.__name__}-{name}.stablehlo"
@@ -87,7 +94,7 @@ def _program(
 
 
 def _read(path: Path) -> jax_export.Exported | None:
-    """The program kept at `path`; None where there is none, or not the one that was written."""
+    """The program kept at `path`, or None if there is none or the file is damaged."""
     try:
         content = path.read_bytes()
     except OSError:
@@ -96,12 +103,12 @@ def _read(path: Path) -> jax_export.Exported | None:
     if told != hashlib.sha256(content).digest():
         return None
     with contextlib.suppress(OSError):
-        os.utime(path)  # used today
+        os.utime(path)  # marks it as used today
     return jax_export.deserialize(bytearray(content))
 
 
 def _keep(path: Path, exported: jax_export.Exported) -> None:
-    """Writes the program to `path`, if there is room, and it is made of what is `storable`."""
+    """Writes the program to `path`, unless the disk refuses or a type in it is not `storable`."""
     try:
         content = exported.serialize()
     except ValueError:
@@ -120,7 +127,7 @@ def _throw_away_unused(folder: Path) -> None:
 
 
 def _versions() -> str:
-    """Of everything that a lowered program depends on but the arguments."""
+    """A folder name that depends on everything that a program depends on, except the arguments."""
     package = Path(__file__).parents[1]
     files = ((path.relative_to(package), path.stat()) for path in sorted(package.rglob("*.py")))
     return "programs-" + _digest(

@@ -1,4 +1,4 @@
-"""Progress: a bar on a terminal, and plain lines where standard error is piped or logged."""
+"""Progress: a bar on a terminal, plain lines if standard error is piped or logged."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-_SECONDS = 10.0  # between two plain lines
+_SECONDS = 10.0  # between plain lines
 _PLAIN = "{desc}: {n_fmt} of {total_fmt}{unit}, {elapsed} so far, about {remaining} left{postfix}"
 
 
@@ -20,15 +20,15 @@ else:
 
 
 class Progress(_Bar):
-    """A `tqdm` that writes a line now and then, without control characters, off a terminal."""
+    """A `tqdm` that, if its stream is not a terminal, writes a plain line every ten seconds."""
 
     def __init__(self, *args: Any, **options: Any):
         stream = options.setdefault("file", sys.stderr)
         if not _is_terminal(stream):
             options |= {"file": _Lines(stream), "mininterval": _SECONDS, "maxinterval": _SECONDS}
-            # lines do not stack: below another bar tqdm would move the cursor
+            # Lines do not stack: for a bar below another one, tqdm would move the cursor.
             options["position"] = 0
-            # Of a total that is not known, tqdm's own words say all there is to say.
+            # If the total is unknown, tqdm's own format is already right.
             if _total(args, options) is not None:
                 options["bar_format"] = _PLAIN
                 options.setdefault("unit", "")
@@ -36,7 +36,7 @@ class Progress(_Bar):
 
 
 class _Lines:
-    """A stream that gets whole lines alone, of what was meant to write over itself."""
+    """Passes whole lines on to a stream, without the control characters that redraw a bar."""
 
     def __init__(self, stream: Any):
         self._stream = stream

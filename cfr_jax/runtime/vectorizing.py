@@ -1,9 +1,10 @@
-"""What `vmap` does to the heavy functions: a batch on a CPU is done cloud by cloud.
+"""How `vmap` treats the heavy functions: on a CPU, a batch is processed one cloud at a time.
 
-Side by side, the activations of all clouds would be in flight at once, and every product would
-become a batch of products with weights of their own (the norms are folded into them, and differ
-from cloud to cloud). On a CPU one cloud keeps all cores busy, and one tile of it fits a cache:
-a batch in turn takes three quarters of the time. Accelerators take it side by side, as usual.
+Side by side, the activations of all clouds would be in memory at once. Every matrix product would
+become a batch of products with different weights, because the norms are folded into the weights
+and differ from cloud to cloud. On a CPU one cloud keeps all cores busy, and a tile of it fits in a
+cache: one cloud at a time takes three quarters of the time. Accelerators process the clouds side by
+side, as usual.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from jax.custom_batching import custom_vmap
 
 
 def cloud_by_cloud(on_cpu: Callable, elsewhere: Callable) -> Callable:
-    """One function, arrays in and arrays out, such that `vmap` maps it in turn on CPUs; two ways to
-    the same result, for CPUs and for the rest."""
+    """A function of arrays that `vmap` maps one example at a time on CPUs, side by side elsewhere.
+
+    `on_cpu` and `elsewhere` compute the same result in two ways.
+    """
 
     @custom_vmap
     def mapped(*arguments: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What training minimizes, for one pair of clouds; batches are maps over these."""
+"""The loss that training minimizes, for one pair of clouds; batches map over it."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from cfr_jax.geometry import rigid
 from cfr_jax.networks.inputs import Cloud
 from cfr_jax.networks.record import Step
 
-_DISCOUNT = 0.5  # the last iteration counts fully, each one before it half of the next
+_DISCOUNT = 0.5  # the last iteration counts fully, each earlier one half as much as the next
 _INLIER_WEIGHT = 0.01
-# Soft targets of the correspondence term, in the unit sphere: measured to learn faster than the
-# pose alone (docs/training.md).
+# Soft targets of the correspondence term (docs/training.md), in radii of the unit sphere. With this
+# term, training was measured to learn faster than with the pose alone.
 _SPREAD = 0.035
 _REACH = 0.1
 
 
 @struct.dataclass
 class PairLoss:
-    """Loss of a pair, its parts, and the errors that people read."""
+    """The loss of a pair, its parts, and the errors that people read."""
 
     total: Float[Array, ""]
     pose: Float[Array, ""]
@@ -43,12 +43,12 @@ def pair_loss(
     *,
     correspondence_weight: float,
 ) -> PairLoss:
-    """The paper's loss of what a network found in its `steps`, and a term for the correspondences.
+    """The paper's loss for the `steps` of a network, plus a term for the correspondences.
 
-    Pose: mean |T_i x - T_truth x| over points and axes, plus 0.01 times the mean slack of both
-    clouds, discounted by 0.5 per iteration before the last. Correspondence: see
-    `correspondence_loss`; same discount; it stores the affinities, however they were matched.
-    `truth` maps source onto target.
+    Pose: the mean of |T_i x - T_truth x| over points and axes, plus 0.01 times the mean slack of
+    both clouds, discounted by 0.5 for each iteration before the last. Correspondence: see
+    `correspondence_loss`, with the same discount. It stores the affinities, whatever the form of
+    the match. `truth` maps source onto target.
     """
     steps = list(steps)
     there = rigid.apply(truth, source.points)
@@ -80,11 +80,12 @@ def _pose_term(step: Step, points: Array, there: Array) -> Array:
 def correspondence_loss(
     log_affinity: Float[Array, "n m"], squared_distance: Float[Array, "n m"]
 ) -> Float[Array, ""]:
-    """Cross-entropy of each row's and each column's affinities, slack included, to soft targets.
+    """Cross-entropy between soft targets and the affinities of each row and column, with slack.
 
-    `squared_distance` is taken under the true motion. A point's partners share, by
-    exp(-d^2 / 2 sigma^2) up to 0.1, as much as the nearest of them is close; the slack has the
-    rest.
+    `squared_distance` is between the points after the true motion. A partner at distance d has the
+    closeness exp(-d^2 / (2 sigma^2)), sigma = 0.035, and zero from d = 0.1 on. All partners of a
+    point together get the closeness of the nearest one as their target, in proportion to their own;
+    the slack gets the rest.
     """
     close = jnp.exp(squared_distance / (-2 * _SPREAD**2))
     close = jnp.where(squared_distance < _REACH**2, close, 0)

@@ -1,4 +1,4 @@
-"""Optimizers and learning rates by name, as a config asks for them."""
+"""Optimizers and learning rates, by the names that configs use."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from jaxtyping import Array, Int, PyTree
 SCHEDULES = ("cosine", "wsd", "constant", "trapezoid")
 OPTIMIZERS = ("adamw", "adam", "lion", "sgd", "muon")
 
-# Smaller sides of the matrices that "muon" turns: below, they are a network's inputs and outputs;
-# above, orthogonalizing costs a tenth of a training step.
+# "muon" orthogonalizes matrices whose smaller side is in this range. Smaller ones are inputs and
+# outputs of a network; for larger ones it would cost a tenth of a training step.
 _HIDDEN = range(32, 129)
 
 
 @dataclasses.dataclass(frozen=True)
 class Trapezoid:
-    """A rate that rises from zero over the warm-up, stays, and falls to zero over the cooldown, in
-    straight lines; both are shares of all steps.
+    """A learning rate that rises from zero, stays at its peak, and falls to zero, all linearly.
 
-    The number of steps is no part of the compiled program: an optimizer made with this keeps it in
-    its state (`planned`), so it may be decided once the speed of a step is known.
+    `warmup` and `cooldown` are shares of all steps. The number of steps is not part of the compiled
+    program: an optimizer made with this schedule keeps it in its state (`planned`), so it can be
+    decided after the speed of a step is known.
     """
 
     peak_rate: float
@@ -39,7 +39,7 @@ class Trapezoid:
         return self.at(count, self.steps)
 
     def at(self, count: ArrayLike, steps: ArrayLike) -> Array:
-        """The same in a training of so many steps."""
+        """The rate of step `count` in a training of `steps` steps."""
         done, steps = jnp.asarray(count, jnp.float32), jnp.asarray(steps, jnp.float32)
         risen = (done + 1) / jnp.maximum(self.warmup * steps, 1)
         left = (steps - done) / jnp.maximum(self.cooldown * steps, 1)
@@ -47,7 +47,7 @@ class Trapezoid:
 
 
 class Planned(NamedTuple):
-    """Where in a training of how many steps an optimizer is."""
+    """The current step of an optimizer, and the number of steps of its training."""
 
     # optax finds the step by this name, which hides a method of tuples
     count: Int[Array, ""]  # type: ignore[assignment]
@@ -55,7 +55,7 @@ class Planned(NamedTuple):
 
 
 def planned(state: optax.OptState, steps: Int[Array, ""]) -> optax.OptState:
-    """An optimizer's state in a training of `steps` steps; the same where its schedule is not a
+    """An optimizer's state for a training of `steps` steps; unchanged unless its schedule is a
     `Trapezoid`."""
     if optax.tree.get(state, "planned_steps") is None:
         return state
@@ -67,10 +67,11 @@ def make_schedule(
 ) -> optax.Schedule:
     """The learning rate over `steps` steps; `warmup` and `cooldown` are shares of them.
 
-    All but the last start at a 25th of the peak and rise over the warm-up. Then "cosine" falls to a
-    thousandth along half a wave; "wsd" (warm-up, stable, decay) stays until the cool-down and falls
-    to a thousandth in a straight line, so that a run can be made longer without starting anew;
-    "constant" stays. "trapezoid" is a `Trapezoid`.
+    "cosine", "wsd" and "constant" start at a 25th of the peak and rise during the warmup. Then
+    "cosine" falls along half a wave to a thousandth of the peak. "wsd" (warmup, stable, decay)
+    stays at the peak until the cooldown and falls linearly to a thousandth, so that a run can be
+    extended without starting over. "constant" stays at the peak. "trapezoid" is a `Trapezoid`.
+    Raises ValueError for an unknown name and for numbers that cannot be used.
     """
     if not steps > 0 or not peak_rate > 0:
         raise ValueError(f"schedule: got {steps} steps at {peak_rate}, wanted both positive")
@@ -99,13 +100,13 @@ def make_schedule(
 def make_optimizer(
     kind: str, schedule: optax.Schedule, *, clip: float, weight_decay: float
 ) -> optax.GradientTransformation:
-    """An optimizer behind a gradient clipped by global norm.
+    """An optimizer, after the gradient is clipped by its global norm.
 
-    "adamw", "lion" and "sgd" (Nesterov momentum 0.9) shrink the weights apart from the gradient.
-    "muon" (Jordan, 2024) orthogonalizes the momentum of hidden matrices, stacked ones each by
-    itself, scaled so that AdamW's rates suit it (Liu et al., 2025), and is AdamW with Nesterov's
-    momentum for the rest. "adam" adds `weight_decay` times the weights to the gradient first, as
-    the published trainings did.
+    "adamw", "lion" and "sgd" (Nesterov momentum 0.9) use decoupled weight decay. "muon" (Jordan,
+    2024) orthogonalizes the momentum of hidden matrices, each matrix of a stack by itself, and
+    scales it so that AdamW's rates suit it (Liu et al., 2025); all other weights use AdamW with
+    Nesterov momentum. "adam" adds `weight_decay` times the weights to the gradient first, as the
+    published trainings did. Raises ValueError for an unknown name.
     """
     if isinstance(schedule, Trapezoid):
         return optax.chain(
@@ -154,7 +155,7 @@ def _scaled_by(schedule: Trapezoid) -> optax.GradientTransformation:
 
 
 def _hidden_matrices(params: PyTree) -> PyTree:
-    """Which axes of a leaf are a hidden matrix's inputs and outputs, or None."""
+    """For each leaf, the axes of a hidden matrix's inputs and outputs, or None if it is not one."""
 
     def axes(leaf: Array) -> optax.contrib.MuonDimensionNumbers | None:
         if leaf.ndim < 2 or min(leaf.shape[-2:]) not in _HIDDEN:

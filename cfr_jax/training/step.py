@@ -23,16 +23,16 @@ from cfr_jax.training.devices import AXIS
 from cfr_jax.training.losses import PairLoss, pair_loss
 
 PRECISIONS = ("float32", "tensorfloat32", "bfloat16")
-# What the products of the learned layers run at: those whose precision is not stated in the
-# program. Distances, covariances, affinities and motions state theirs, and stay float32 in every
-# case. With "bfloat16" it is the heavy extraction's activations that are less precise
-# (`Settings.activations`). A CPU multiplies in float32 whatever is asked for.
+# The precision of the products in learned layers, that is, of all products whose precision is not
+# stated in the program. Distances, covariances, affinities and motions state theirs, and always
+# stay float32. With "bfloat16", the activations of the heavy extraction are less precise as well
+# (`Settings.activations`). A CPU always multiplies in float32.
 _PRODUCTS = {"float32": "float32", "tensorfloat32": "tensorfloat32", "bfloat16": "tensorfloat32"}
 
 
 @struct.dataclass
 class TrainState:
-    """All that a step changes."""
+    """Everything that a step changes."""
 
     step: Int[Array, ""]
     params: Params
@@ -40,14 +40,14 @@ class TrainState:
     """Exponential moving average of the parameters: what is validated and shipped."""
     optimizer: optax.OptState
     skipped: Int[Array, ""]
-    """Steps left out because their gradient was not finite, or came after too many such."""
+    """Number of steps skipped because their gradient was not finite, or after too many of those."""
     skipped_in_row: Int[Array, ""]
-    """How many of them came last, one after the other."""
+    """How many of the latest steps were skipped, without a good one in between."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """What a step is compiled for."""
+    """What a step depends on when it is compiled."""
 
     unroll: Unroll
     settings: Hashable
@@ -58,7 +58,7 @@ class Recipe:
     pairs_at_once: int
     precision: str
     max_skipped: int
-    """How many steps in a row may be left out; after more, nothing changes any more."""
+    """How many steps in a row may be skipped; after more than these, nothing changes anymore."""
 
 
 def init_state(params: Params, optimizer: optax.GradientTransformation) -> TrainState:
@@ -77,14 +77,14 @@ def init_state(params: Params, optimizer: optax.GradientTransformation) -> Train
 def train_step(
     state: TrainState, batch: dict[str, Array], *, recipe: Recipe
 ) -> tuple[TrainState, PairLoss]:
-    """One step on a batch of `data.batches`, its losses and errors pair by pair.
+    """One step on a batch of `data.batches`; also returns losses and errors, pair by pair.
 
-    The pairs are spread evenly over the mesh. A device accumulates the gradient of its share,
-    `pairs_at_once` pairs vectorized and the rest one after the other, so that any batch fits: on
-    CPU one at a time keeps the activations in cache and is fastest, an accelerator wants many. A
-    step whose gradient is not finite changes nothing but the counts of skipped steps; once more
-    than `max_skipped` came in a row none changes anything, so that the loop, which looks but now
-    and then, finds it so.
+    The pairs are spread evenly over the mesh. Each device accumulates the gradient of its share
+    over groups of `pairs_at_once` vectorized pairs, so that any batch fits in memory. On a CPU, one
+    at a time keeps the activations in the cache and is fastest; an accelerator wants many. If the
+    gradient is not finite, a step only advances the counts of steps and skipped steps. After more
+    than `max_skipped` such steps in a row, no further step changes anything else either, so that
+    the loop, which checks only now and then, finds that state.
     """
     return _advance(state, batch, recipe)
 
@@ -100,8 +100,11 @@ def train_on_drawn(
     recipe: Recipe,
     sampling: Sampling,
 ) -> tuple[TrainState, PairLoss]:
-    """`k` steps in one go, each on pairs that the devices draw (`data.device_pairs`): shape
-    `items[i]` at place `positions[i]` of the stream. Losses of all k b pairs."""
+    """`k` steps at once, each on pairs that the devices draw (`data.device_pairs`).
+
+    Step i draws pairs of the shapes `items[i]` at the positions `positions[i]` of the stream. Also
+    returns the losses of all k b pairs.
+    """
 
     def draw(shapes: Shapes, seed: Array, items: Array, positions: Array) -> dict[str, Array]:
         return draw_pairs(shapes, seed, items, positions, sampling)
@@ -130,14 +133,14 @@ def _advance(
             mesh=recipe.mesh,
             in_specs=(P(), P(AXIS)),
             out_specs=P(),
-            check_vma=False,  # derivatives written by hand say nothing of devices
+            check_vma=False,  # hand-written derivatives do not declare how they vary over devices
         )(state.params, batch)
     lost = state.skipped_in_row > recipe.max_skipped
     sound = jnp.isfinite(optax.tree.norm(gradient)) & ~lost
     gradient = jax.tree.map(lambda leaf: jnp.where(sound, leaf, 0), gradient)
     updates, moments = recipe.optimizer.update(gradient, state.optimizer, state.params)
     params = optax.apply_updates(state.params, updates)
-    # early in a run a long average would still be the initial weights
+    # early in a run, a long average would still consist of the initial weights
     decay = jnp.minimum(recipe.average_decay, (1 + state.step) / (10 + state.step))
     average = jax.tree.map(lambda a, p: a + (1 - decay) * (p - a), state.average, params)
 
@@ -176,7 +179,7 @@ def _mean_gradient(
     at_once = min(recipe.pairs_at_once, size)
 
     def add(total: Params, pairs: dict[str, Array]) -> tuple[Params, PairLoss]:
-        if at_once == 1:  # a batch axis of one would send XLA's products down a slower path
+        if at_once == 1:  # with a batch axis of length one, XLA would choose slower products
             gradient, measured = gradient_of(params, jax.tree.map(lambda leaf: leaf[0], pairs))
             measured = jax.tree.map(lambda leaf: leaf[None], measured)
         else:
@@ -184,8 +187,8 @@ def _mean_gradient(
             gradient = jax.tree.map(lambda leaf: leaf.sum(0), gradient)
         return jax.tree.map(jnp.add, total, gradient), measured
 
-    # Gradients are summed as they come: a map differentiated as a whole would keep the activations
-    # of all its pairs.
+    # Gradients are summed as they come: differentiating one map over all pairs would keep the
+    # activations of all of them.
     chunks = jax.tree.map(lambda leaf: leaf.reshape(-1, at_once, *leaf.shape[1:]), batch)
     total, measured = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), chunks)
     measured = jax.tree.map(lambda leaf: leaf.reshape(size, *leaf.shape[2:]), measured)
@@ -213,8 +216,10 @@ def predict(
     mesh: Mesh,
     pairs_at_once: int = 1,
 ) -> Array:
-    """Transforms (b, L, 4, 4) of a batch that needs no training; each device takes its share,
-    `pairs_at_once` pairs vectorized and the rest one after the other, all in float32."""
+    """The transforms (b, L, 4, 4) of a batch, without training, in float32.
+
+    Each device takes its share, in groups of `pairs_at_once` vectorized pairs.
+    """
 
     def of_pair(params: Params, pair: dict[str, Array]) -> Array:
         source, target = (_cloud(pair, side) for side in ("source", "target"))

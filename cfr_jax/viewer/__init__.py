@@ -1,4 +1,4 @@
-"""Pictures of a registration: an HTML page to turn it in, a PNG to print, a Rerun recording."""
+"""Pictures of a registration: an interactive HTML page, a PNG, and a Rerun recording."""
 
 from cfr_jax.viewer.page import write_page
 from cfr_jax.viewer.picture import write_picture

@@ -1,4 +1,4 @@
-"""The registration as one HTML page: no network, no dependencies, opens from a file."""
+"""The registration as one HTML page that opens from a file, without a network or dependencies."""
 
 import base64
 import hashlib
@@ -18,18 +18,18 @@ from cfr_jax.viewer.camera import Camera, best_view
 from cfr_jax.viewer.scene import Scene
 
 INT16 = 32767
-UNUSED = 255  # weight byte of a point the network did not use; used ones are 0 … 254
+UNUSED = 255  # weight byte of a point that the network did not use; used points have 0 … 254
 
 
 def write_page(path: str | os.PathLike[str], scene: Scene, *, max_points: int = 20_000) -> None:
-    """Writes an interactive page of `scene` to `path`, replacing what was there.
+    """Writes an interactive page of `scene` to `path`, replacing any existing file.
 
-    Clouds with more than `max_points` points are thinned (at random, always the same way; points
-    with a weight are kept first), and coordinates are rounded to 1/65534 of each cloud's extent:
-    the page shows the registration, it does not carry the data. Text from the scene is only ever
-    shown as text.
+    Clouds with more than `max_points` points are thinned at random, always in the same way, and
+    points with a weight are kept first. Coordinates are rounded to 1/65534 of each cloud's extent,
+    because the page shows the registration and is not meant to store the data. Text from the scene
+    is only ever shown as text, never as HTML.
 
-    Raises ValueError if `max_points` is not a positive integer, OSError if `path` cannot be
+    Raises ValueError if `max_points` is not a positive integer, and OSError if `path` cannot be
     written.
     """
     if isinstance(max_points, bool) or not isinstance(max_points, int) or max_points < 1:
@@ -40,13 +40,13 @@ def write_page(path: str | os.PathLike[str], scene: Scene, *, max_points: int = 
         "title": _text_for_html(f"{scene.source_name} → {scene.target_name}"),
         "scene": _json_for_html(_payload(scene, best_view(scene), max_points)),
     }
-    # One pass: a name that looks like a placeholder is never filled in its turn.
+    # In one pass, so that a name that looks like a placeholder is not replaced.
     page = re.sub(r"\{\{(csp|title|scene)\}\}", lambda match: fills[match[1]], template)
     write_atomically(path, page.encode())
 
 
 def _content_security_policy(template: str) -> str:
-    """Allows the template's own script and style by their hashes, and nothing else."""
+    """A policy that allows only the template's own script and style, by their hashes."""
     allowed = {
         tag: " ".join(
             f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
@@ -61,12 +61,12 @@ def _content_security_policy(template: str) -> str:
 
 
 def _text_for_html(text: str) -> str:
-    """Escaped and plain ASCII: a file name may hold bytes that no encoding can write."""
+    """Escapes to plain ASCII, because a file name may hold bytes that no encoding can write."""
     return html.escape(text).encode("ascii", "xmlcharrefreplace").decode("ascii")
 
 
 def _json_for_html(value: dict[str, Any]) -> str:
-    """JSON that cannot end the script element around it, nor open anything inside it."""
+    """JSON that cannot close the script element around it or open another one."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
@@ -74,9 +74,9 @@ def _json_for_html(value: dict[str, Any]) -> str:
 
 
 def _payload(scene: Scene, camera: Camera, max_points: int) -> dict[str, Any]:
-    """What page.html reads; lengths in units of `scale`, positions relative to the view's center.
+    """The data for page.html: lengths in units of `scale`, positions relative to the view's center.
 
-    Large offsets (map coordinates) are removed here, in float64, so that the page may compute in
+    Large offsets (map coordinates) are removed here in float64, so that the page can compute in
     float32.
     """
     scale = float(camera.radii[-1])
@@ -102,8 +102,8 @@ def _payload(scene: Scene, camera: Camera, max_points: int) -> dict[str, Any]:
                 "label": label,
                 "matrix": transform.tolist(),
                 "rotation": motions.to_quaternion(transform[:3, :3]).tolist(),
-                # Where the middle of the source lies: what moves evenly between two stations,
-                # whatever the distance of the cloud from its origin.
+                # Position of the middle of the source. It moves evenly between two stations, no
+                # matter how far the cloud is from its origin.
                 "position": (
                     (motions.apply(transform, source_center) - camera.center) / scale
                 ).tolist(),
@@ -122,7 +122,7 @@ def _payload(scene: Scene, camera: Camera, max_points: int) -> dict[str, Any]:
 def _thin(
     count: int, max_points: int, weights: Float64[np.ndarray, " n"] | None
 ) -> Int[np.ndarray, " k"]:
-    """Indices of at most `max_points` points, in order; those with a weight come first."""
+    """Ascending indices of at most `max_points` points; those with a weight are chosen first."""
     if count <= max_points:
         return np.arange(count)
     order = np.random.default_rng(0).permutation(count)
@@ -134,7 +134,10 @@ def _thin(
 def _quantize(
     points: Float64[np.ndarray, "n 3"], scale: float
 ) -> tuple[Float64[np.ndarray, " 3"], dict[str, Any]]:
-    """Middle of the points, and their int16 offsets from it: offset · size / 32767 · scale."""
+    """The middle of the points, and their offsets from it as int16.
+
+    In the caller's units, an offset is int16 · size / 32767 · scale.
+    """
     low, high = points.min(axis=0), points.max(axis=0)
     center = (low + high) / 2
     extent = float((high - low).max()) / 2

@@ -1,4 +1,4 @@
-"""The registration as a PNG: before beside after, for papers, reports and READMEs."""
+"""The registration as a PNG with before and after side by side, for papers and reports."""
 
 import io
 import os
@@ -17,31 +17,31 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SOURCE = np.array([1.0, 0.706, 0.0])  # the colors Open3D users know
+SOURCE = np.array([1.0, 0.706, 0.0])  # these colors are familiar from Open3D
 TARGET = np.array([0.0, 0.651, 0.929])
 INK, WARN = "#1b2029", "#8a5a00"
-HAZE = 0.45  # how far the points at the back fade into the paper
+HAZE = 0.45  # how much the points at the back fade into the white background
 
 # Inches.
 WIDTH, MARGIN, TOP, LINE, DPI = 10.0, 0.15, 1.0, 0.26, 160
-FLATTEST, TALLEST = 0.45, 1.1  # height of a panel by its width
+FLATTEST, TALLEST = 0.45, 1.1  # limits for the height of a panel divided by its width
 
 MOST_POINTS = 20_000  # per cloud; a panel has no room for more
 
-# A start this much wider than the answer would leave the answer a dot: each panel then has its
-# own scale, and the title says so.
+# If the start is this many times wider than the answer, the answer would be a dot at the same
+# scale. Each panel then has its own scale, and the title says so.
 WIDEST = 2.5
 
 
 def write_picture(path: str | os.PathLike[str], scene: Scene) -> None:
     """Writes a PNG of `scene`, before and after side by side, to `path`; needs no display.
 
-    Both panels look along the direction of least spread of the aligned clouds, tilted a little, at
-    one scale (unless the source starts so far away that the title must say otherwise). The same
-    scene gives the same file, with one version of matplotlib.
+    Both panels look along the direction of least spread of the aligned clouds, tilted a little.
+    They have the same scale, unless the source starts very far away; then the title says so. With
+    one version of matplotlib, the same scene always gives the same file.
 
-    Raises ModuleNotFoundError without matplotlib (the `viz` extra), OSError if `path` cannot be
-    written.
+    Raises ModuleNotFoundError if matplotlib (the `viz` extra) is missing, and OSError if `path`
+    cannot be written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -80,7 +80,7 @@ def write_picture(path: str | os.PathLike[str], scene: Scene) -> None:
 
     png = io.BytesIO()
     with warnings.catch_warnings():
-        # A name in letters that matplotlib's font lacks is drawn as boxes, without a fuss.
+        # Letters that matplotlib's font lacks are drawn as boxes, without a warning.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         figure.savefig(png, format="png", dpi=DPI, metadata={"Software": None})
     write_atomically(path, png.getvalue())
@@ -95,8 +95,9 @@ def _some(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "k 3"]:
 def _frames(
     panels: list[tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "m 3"]]],
 ) -> tuple[list[np.ndarray], list[np.ndarray], float | None]:
-    """Middle and half size of each panel, and how much wider the first is seen (None: equal)."""
-    # Quantiles, so that a stray point does not shrink the rest; what lies around them is margin.
+    """Center and half size of each panel, and how many times wider the first one's view is (None:
+    equal)."""
+    # Quantiles, so that a stray point does not shrink the rest. A margin is added below.
     ends = np.array(
         [[np.quantile(cloud[:, :2], [0.01, 0.99], axis=0) for cloud in clouds] for clouds in panels]
     )  # panel, cloud, low or high, axis
@@ -116,7 +117,7 @@ def _draw_clouds(
     target: Float64[np.ndarray, "m 3"],
     depth: float,
 ) -> None:
-    """Both clouds in one scatter, from back to front, so that neither hides the other by order."""
+    """Draws both clouds in one scatter from back to front, so that neither is always on top."""
     points = np.concatenate([source, target])
     colors = np.repeat([SOURCE, TARGET], [len(source), len(target)], axis=0)
     haze = HAZE * np.clip(0.5 - points[:, 2:] / (2 * depth), 0.0, 1.0)
@@ -128,7 +129,7 @@ def _draw_clouds(
         points[order, 1],
         s=diameter**2,
         c=colors[order],
-        # a thin rim keeps neighbors apart; matplotlib takes an (n, 3) array, its stubs do not
+        # A thin rim separates neighbors. Matplotlib accepts an (n, 3) array, its stubs do not.
         edgecolors=0.72 * colors[order],  # type: ignore[arg-type]
         linewidths=0.08 * diameter,
     )
@@ -164,8 +165,8 @@ def _write_legend(figure: "Figure", scene: Scene, y: float) -> None:
 
 
 def _lines(scene: Scene) -> list[tuple[str, str]]:
-    """Facts, then warnings, broken into lines as wide as the picture; with their colors."""
-    # A fact is not torn apart: its own spaces do not break.
+    """Facts, then warnings, wrapped to the width of the picture, with their colors."""
+    # Non-breaking spaces keep each fact on one line.
     facts = [f"{name}\u00a0 {text}".replace(" ", "\u00a0") for name, text in scene.facts.items()]
     texts = [("     ".join(facts), INK)] + [(text, WARN) for text in scene.warnings]
     return [
@@ -176,7 +177,7 @@ def _lines(scene: Scene) -> list[tuple[str, str]]:
 
 
 def _printable(text: str) -> str:
-    """Text without control characters and undecodable bytes, which no font can draw."""
+    """The text with control characters and undecodable bytes replaced, which no font can draw."""
     return "".join(
         c if c.isprintable() or c == "\u00a0" else "\N{REPLACEMENT CHARACTER}" for c in text
     )

@@ -1,4 +1,4 @@
-"""The registration as a recording for the Rerun viewer: the motion on a time line of its own."""
+"""The registration as a recording for the Rerun viewer, with the motion on its own timeline."""
 
 import os
 
@@ -14,14 +14,14 @@ PIXELS = 2.5  # diameter of a point
 
 
 def write_recording(path: str | os.PathLike[str], scene: Scene) -> None:
-    """Writes `scene` as an `.rrd` file, for `rerun FILE`, replacing what was there.
+    """Writes `scene` as an `.rrd` file for `rerun FILE`, replacing any existing file.
 
-    Entities: `target`, `source` (a transform for each station of the time line "station"),
-    `source/points`, and the texts `result` and `station`. Rerun computes in float32, so that
-    positions are given from the middle of the aligned clouds; `result` says where that is.
+    Entities: `target`, `source` (a transform for each station of the timeline "station"),
+    `source/points`, and the texts `result` and `station`. Rerun computes in float32, so positions
+    are relative to the middle of the aligned clouds; `result` says where that is.
 
-    Raises ModuleNotFoundError without rerun (the `rerun` extra), OSError if `path` cannot be
-    written.
+    Raises ModuleNotFoundError if rerun (the `rerun` extra) is missing, and OSError if `path` cannot
+    be written.
     """
     try:
         import rerun as rr
@@ -45,7 +45,7 @@ def write_recording(path: str | os.PathLike[str], scene: Scene) -> None:
         stream.log("target", points(scene.target - center, TARGET), static=True)
         stream.log("source/points", points(scene.source - middle, SOURCE), static=True)
         for k, (label, transform) in enumerate(zip(scene.labels, scene.transforms, strict=True)):
-            # of the source's middle, and without the offset: a difference taken in float64
+            # position of the source's middle; the offset is subtracted in float64
             position = motions.apply(transform, middle) - center
             stream.set_time("station", sequence=k)
             stream.log("station", rr.TextDocument(label))
@@ -58,5 +58,5 @@ def _text(scene: Scene, center: np.ndarray) -> str:
     lines = [f"source: {scene.source_name}", f"target: {scene.target_name}"]
     lines += [f"{name}: {text}" for name, text in scene.facts.items()]
     lines += [f"warning: {text}" for text in scene.warnings]
-    lines.append(f"positions are given from {center.tolist()} in the target's frame")
+    lines.append(f"positions are relative to {center.tolist()} in the target's frame")
     return "\n".join(lines).encode("utf-8", "replace").decode("utf-8")

@@ -1,4 +1,4 @@
-"""What a picture of one registration shows: two clouds, the stations of the motion, the facts."""
+"""The content of a picture of one registration: two clouds, the stations of the motion, facts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ class Scene:
     """One registration, ready to be drawn; every array is copied to read-only float64.
 
     `source` (n, 3) and `target` (m, 3) are in the caller's own frames and units. `transforms`
-    (S, 4, 4) are the stations of the motion in order, each mapping the *original* source onto the
-    target (`T @ [x; 1]`): first where the source starts (the identity or the initial transform),
-    then one per iteration, last the answer. `labels` names each station.
+    (S, 4, 4) are the stations of the motion in order. Each maps the *original* source onto the
+    target (`T @ [x; 1]`): first the start (the identity or the initial transform), then one per
+    iteration, and last the answer. `labels` has the name of each station.
 
-    `weights` (n,) is the correspondence weight of each source point, about 0 to 1; NaN marks a
-    point the network did not use, None means no weights are known. `facts` are short label → text
-    pairs shown in their order, `warnings` are sentences shown above them.
+    `weights` (n,) is the correspondence weight of each source point, about 0 to 1. NaN marks a
+    point that the network did not use; None means that no weights are known. `facts` are short
+    label → text pairs, shown in their order. `warnings` are sentences.
 
     Raises ValueError, naming the argument, for a wrong shape, an empty cloud, a coordinate that is
-    not finite, fewer than two stations, a transform that is not a rigid motion, negative weights,
-    or facts that are not text yet.
+    not finite, fewer than two stations, a transform that is not a rigid motion, weights that are
+    negative or infinite, or facts that are not text.
     """
 
     source: Float64[np.ndarray, "n 3"]
@@ -40,7 +40,7 @@ class Scene:
     target_name: str
     warnings: tuple[str, ...]
 
-    # Written out, as it takes anything like an array.
+    # Written by hand because it accepts anything like an array.
     def __init__(
         self,
         source: ArrayLike,
@@ -75,7 +75,7 @@ class Scene:
             object.__setattr__(self, name, value)
 
     def moved(self, station: int) -> Float64[np.ndarray, "n 3"]:
-        """Source points at one station, in the target's frame."""
+        """The source points at one station, in the target's frame."""
         transform = self.transforms[station]
         return motions.apply(transform, self.source)
 
@@ -84,7 +84,9 @@ def _array(name: str, value: ArrayLike) -> Float64[np.ndarray, "..."]:
     try:
         array = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: got {type(value).__name__}, wanted an array of reals") from error
+        raise ValueError(
+            f"{name}: got {type(value).__name__}, wanted an array of real numbers"
+        ) from error
     array.flags.writeable = False
     return array
 
@@ -110,7 +112,9 @@ def _stations(value: ArrayLike) -> Float64[np.ndarray, "s 4 4"]:
 def _weights(value: ArrayLike, count: int) -> Float64[np.ndarray, " n"]:
     weights = _array("weights", value)
     if weights.shape != (count,):
-        raise ValueError(f"weights: got shape {weights.shape}, wanted ({count},), one per source")
+        raise ValueError(
+            f"weights: got shape {weights.shape}, wanted ({count},), one per source point"
+        )
     if (weights < 0).any() or np.isinf(weights).any():
         raise ValueError(
             f"weights: got values from {np.nanmin(weights)} to {np.nanmax(weights)}, "
@@ -120,14 +124,14 @@ def _weights(value: ArrayLike, count: int) -> Float64[np.ndarray, " n"]:
 
 
 def _texts(name: str, value: Sequence[str]) -> tuple[str, ...]:
-    # A lone string is a sequence too, and would silently become one text per letter.
+    # A single string is a sequence, too, and would silently become one text per letter.
     if isinstance(value, str):
         raise ValueError(f"{name}: got the string {value!r}, wanted a sequence of strings")
     return tuple(value)
 
 
 def _facts(value: Mapping[str, Any]) -> Mapping[str, str]:
-    # How many digits a number deserves is known where it comes from, not here.
+    # Only the caller knows how many digits a number deserves, so numbers are not converted here.
     for name, text in value.items():
         if not isinstance(text, str):
             raise ValueError(f"facts[{name!r}]: got {text!r}, wanted text")

@@ -1,1 +1,1 @@
-"""Weights on disk: files, cards, the authors' checkpoints, exported programs."""
+"""Weights on disk: files, cards, checkpoints of the papers' authors, and exported programs."""

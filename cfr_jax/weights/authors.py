@@ -1,9 +1,10 @@
-"""The published PyTorch checkpoints of networks, as parameters of this package.
+"""Converts published PyTorch checkpoints of networks to parameters of this package.
 
-Which tensor goes where stands in the record of each network (`networks.record.Checkpoint`).
+The record of each network (`networks.record.Checkpoint`) says which tensor goes where.
 
-A checkpoint's layers are named by their place in PyTorch's modules. A 1x1 convolution is a Linear
-whose weight (out, in) carries one or two more axes of length 1; our kernels are (in, out).
+A checkpoint's tensors are named by their place in PyTorch's modules. The weight of a 1x1
+convolution is that of a Linear layer, (out, in), with one or two extra axes of length 1. Our
+kernels are (in, out).
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from cfr_jax.networks.record import Checkpoint, Network, Params
 
 
 def convert(path: str | Path) -> Params:
-    """Parameters from a checkpoint of a network's authors: CFR or RPM-Net.
+    """Parameters from a checkpoint by a network's authors, such as CFR or RPM-Net.
 
-    Its names tell which of the two it is; `weights.files.network_of` says which it was. `path` is a
-    PyTorch file (.pth or .pt, needs torch; tensors alone are read, no object is ever unpickled), or
-    a .safetensors or .npz file of the same tensors under the same names. Of CFR as many iterations
-    as it holds are kept. Raises ValueError naming every tensor that is missing, unknown, of a wrong
-    shape, or not finite.
+    The names of the tensors decide which network it is; `weights.files.network_of` tells it from
+    the result. `path` is a PyTorch file (.pth or .pt; needs torch, which reads only tensors and
+    unpickles no objects), or a .safetensors or .npz file with the same tensors under the same
+    names. For CFR, all iterations in the file are kept. Raises ValueError, naming every tensor that
+    is missing, unknown, of the wrong shape, or not finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -49,12 +50,12 @@ def convert(path: str | Path) -> Params:
             f'path: {path.name} is a PyTorch file: pip install "cfr_jax[torch]" to read it'
         ) from error
     except Exception as error:  # a damaged archive may raise anything
-        raise ValueError(f"path: {path} is no readable checkpoint ({error})") from error
+        raise ValueError(f"path: {path} is not a readable checkpoint ({error})") from error
     return from_state_dict(state, str(path))
 
 
 def from_state_dict(state: dict[str, np.ndarray], name: str = "state_dict") -> Params:
-    """`convert` for tensors that are already in memory, as arrays; `name` stands in errors."""
+    """`convert` for arrays that are already in memory. `name` is used in error messages."""
     record, checkpoint = _recognized(state, name)
     places = checkpoint.places(state)
     fresh = functools.partial(record.fresh, **checkpoint.arguments(state))
@@ -86,7 +87,7 @@ def from_state_dict(state: dict[str, np.ndarray], name: str = "state_dict") -> P
 
 
 def _recognized(names: Collection[str], where: str) -> tuple[Network, Checkpoint]:
-    """The network whose authors published tensors of these names."""
+    """The network whose authors' checkpoints have tensors with these names."""
     titles = []
     for record in map(table.network, table.names()):
         if record.checkpoint is None:
@@ -94,11 +95,13 @@ def _recognized(names: Collection[str], where: str) -> tuple[Network, Checkpoint
         if record.checkpoint.recognizes(names):
             return record, record.checkpoint
         titles.append(record.title)
-    raise ValueError(f"{where} does not hold {' or '.join(titles)}: no tensor has a name of theirs")
+    raise ValueError(
+        f"{where} does not hold {' or '.join(titles)}: the names of its tensors match none of them"
+    )
 
 
 def _squeezed(shape: tuple[int, ...], axes: int) -> tuple[int, ...]:
-    """The shape without the last axes of a 1x1 convolution."""
+    """The shape without the extra last axes of a 1x1 convolution."""
     beyond = shape[axes:] if axes == 2 else ()
     return shape[:axes] if len(beyond) <= 2 and set(beyond) <= {1} else shape
 

@@ -1,7 +1,7 @@
-"""Cards of the weights that ship: where they come from, and how well they were measured.
+"""Cards of the shipped weights: where they come from, and how well they do.
 
-A card is `shipped/NAME.json` beside `shipped/NAME.safetensors`; `models.schema.json` describes it.
-Reading one needs no JAX.
+A card is `shipped/NAME.json`, next to `shipped/NAME.safetensors`. `models.schema.json` describes
+its format. Reading a card does not need JAX.
 """
 
 from __future__ import annotations
@@ -16,39 +16,42 @@ FORMAT = "cfr_jax/model/1"
 
 
 def names() -> tuple[str, ...]:
-    """Weights that have a card."""
+    """Names of the weights that have a card."""
     weights = sorted(FOLDER.glob("*.safetensors"))
     return tuple(path.stem for path in weights if path.with_suffix(".json").exists())
 
 
 def read_card(name: str) -> dict[str, Any]:
-    """The card of shipped weights, with the digest, size and count of numbers of their file.
+    """The card of shipped weights, with the digest, size and number of parameters of their file.
 
-    Raises ValueError where there are no such weights, where one of the two files is damaged, and
-    where the card was written for others.
+    Raises ValueError if there are no such weights, if the card or the weights file is damaged, or
+    if the card belongs to other weights.
     """
     if name not in names():
-        raise ValueError(f"no weights called {name!r}; shipped are {', '.join(names())}")
+        raise ValueError(
+            f"there are no shipped weights called {name!r}; shipped are {', '.join(names())}"
+        )
     path = FOLDER / f"{name}.json"
     try:
         card = json.loads(path.read_text("utf-8"))
         sha256 = card["sha256"]
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is damaged: no card of weights ({error!r})") from error
+        raise ValueError(f"{path} is damaged: it is not a card of weights ({error!r})") from error
     file = file_facts(FOLDER / f"{name}.safetensors")
     if sha256 != file["sha256"]:
         raise ValueError(
-            f"the card of {name!r} is of other weights ({sha256[:12]}) than those that "
-            f"are there ({file['sha256'][:12]})\n"
-            f"`python tools/model_card.py {name}` measures and writes it anew"
+            f"the card of {name!r} belongs to other weights ({sha256[:12]}) than the file that "
+            f"is there ({file['sha256'][:12]})\n"
+            f"`python tools/model_card.py {name}` measures these and updates the card"
         )
     return {**card, **file}
 
 
 def file_facts(path: Path) -> dict[str, Any]:
-    """Digest, parameters and bytes of a safetensors file, from its header alone.
+    """Digest, number of parameters and bytes of a safetensors file, from its header alone.
 
-    Raises ValueError, naming the file, where that cannot be read; what it says is not checked.
+    The header's content is not checked. Raises ValueError, naming the file, if the header cannot be
+    read.
     """
     size = path.stat().st_size
     try:
@@ -62,4 +65,4 @@ def file_facts(path: Path) -> dict[str, Any]:
             "bytes": size,
         }
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged: no header of safetensors ({error!r})") from error
+        raise ValueError(f"{path} is damaged: it has no safetensors header ({error!r})") from error

@@ -1,4 +1,5 @@
-"""Weights on disk: safetensors, one array per parameter, named by its path in the tree."""
+"""Weights on disk: safetensors files with one array per parameter, named by its path in the
+tree."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ DEFAULT = "object"
 
 
 class NoWeights(ValueError):
-    """There is no such file, and nothing that ships has that name."""
+    """There is no such file, and no shipped weights have that name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,70 +36,69 @@ class Weights:
     """Parameters and where they come from."""
 
     params: Params
-    """With their calibration, where the file has one (`networks.probability`)."""
+    """Includes the calibration, if the file has one (`networks.probability`)."""
     name: str
     network: str
-    """Its name in the table of networks; read off the names of the tensors."""
+    """The network's name in the table of networks, recognized from the names of the tensors."""
     sha256: str
-    """Over the tensors and the notes, as written into the file when it was made."""
+    """Digest of the tensors and the notes, as written into the file when it was made."""
     notes: dict[str, str]
-    """Whatever else the file says of them."""
+    """All other notes in the file."""
 
 
 def save_params(path: str | Path, params: Params, notes: dict[str, str] | None = None) -> None:
-    """Writes parameters and notes about them (strings), beside first and then renamed.
+    """Writes parameters and notes about them (strings) to a temporary file, then renames it.
 
-    The calibration of the parameters, if they have one, becomes a note, too. Raises OSError, naming
-    the file, where it cannot be written, and ValueError for notes under a name that is taken.
+    The calibration of the parameters, if they have one, is also written as a note. Raises OSError,
+    naming the file, if it cannot be written, and ValueError for a note under a reserved name.
     """
     path, notes = Path(path), dict(notes or {})
     for name in notes.keys() & {KEY, "sha256"}:
-        raise ValueError(f"notes: got {name!r}, which is written by itself; wanted other names")
+        raise ValueError(f"notes: got the reserved name {name!r}, wanted another name")
     if (calibration := calibration_of(params)) is not None:
         notes[KEY] = calibration.write()
     tensors = {name: np.asarray(leaf) for name, leaf in _flat(params).items()}
     try:
-        # as bytes: a file that safetensors writes is closed to everyone but its owner
+        # as bytes, because a file that safetensors writes is readable only by its owner
         write_atomically(path, save(tensors, metadata=notes | {"sha256": _digest(tensors, notes)}))
     except OSError as error:
         raise OSError(f"weights: {path} could not be written ({error})") from error
 
 
 def load_params(source: str | Path = DEFAULT, network: str = "cfr") -> Params:
-    """Parameters that ship with the package, by name, or of a .safetensors file, by path.
+    """Parameters that ship with the package, by name, or from a .safetensors file, by path.
 
-    A pytree of float32 arrays for `register`, or for the `unroll` of another `network` of the
-    table. `params["calibration"]` is what the confidence is computed with; weights that nobody
-    calibrated (`cfr calibrate`) lack it, and give no confidence. It has no leaves: gradients and
-    optimizers pass it by.
-    Raises ValueError as `read_weights` does.
+    They are a pytree of float32 arrays for `register`, or for the `unroll` of another `network` in
+    the table. `params["calibration"]` has the coefficients of the confidence. Weights that were not
+    calibrated (`cfr calibrate`) lack it and give no confidence. It has no leaves, so gradients and
+    optimizers ignore it. Raises ValueError as `read_weights` does.
     """
     return read_weights(source, network).params
 
 
 def shipped() -> tuple[str, ...]:
-    """Names of the weights in the package."""
+    """Names of the weights that ship with the package."""
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
 
 
 def network_of(params: Params) -> str:
-    """The name of the network that parameters are made for, told by theirs."""
+    """The name of the network that the parameters are made for, recognized from their names."""
     return table.recognize(_flat(params)).name
 
 
 def read_weights(source: str | Path = DEFAULT, network: str | None = None) -> Weights:
-    """Weights with their network, name, digest and notes.
+    """Reads weights with their network, name, digest and notes.
 
-    Raises `NoWeights` where there is no such name or file, and ValueError where the file is not
-    sound (its digest does not fit, its calibration is damaged) or holds another network than
-    `network` (None: takes any).
+    Raises `NoWeights` if there is no such name or file. Raises ValueError if the file is damaged
+    (its digest does not match, or its calibration is malformed) or holds a different network than
+    `network` (None: any).
     """
     path = Path(source)
     if str(source) in shipped():
         path = SHIPPED / f"{source}.safetensors"
     if not path.is_file():
         raise NoWeights(
-            f"weights: no file and no shipped weights called {str(source)!r}; "
+            f"weights: there is no file and no shipped weights called {str(source)!r}; "
             f"shipped are {', '.join(shipped()) or 'none'}"
         )
     try:
@@ -106,26 +106,26 @@ def read_weights(source: str | Path = DEFAULT, network: str | None = None) -> We
             notes = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError, ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"weights: {path} is no readable safetensors file ({error})") from error
+        raise ValueError(f"weights: {path} is not a readable safetensors file ({error})") from error
     told = notes.pop("sha256", None)
     if told is None:
         raise ValueError(
-            f"weights: {path} carries no digest, so it was not written by cfr_jax; "
-            "the authors' own tensors go through `cfr convert` first"
+            f"weights: {path} has no digest, so cfr_jax did not write it; "
+            "convert the authors' own tensors with `cfr convert` first"
         )
     if told != _digest(tensors, notes):
-        raise ValueError(f"weights: {path} is damaged: its digest does not fit its content")
+        raise ValueError(f"weights: {path} is damaged: its digest does not match its content")
     try:
         record = table.recognize(tensors)
         calibration = _calibration(notes.pop(KEY, None))
     except ValueError as error:
         raise ValueError(f"weights: {path}: {error}") from error
-    if path.parent != SHIPPED:  # those are checked by the tests: tracing a network takes a second
+    if path.parent != SHIPPED:  # tests check those, because tracing a network takes a second
         _check_shapes(path, tensors, record)
     if network not in (None, record.name):
         wanted = table.network(network).title
         raise ValueError(f"weights: {path} holds the network {record.title}, wanted {wanted}")
-    # not jnp.asarray, which compiles a copy of each shape
+    # not jnp.asarray, which compiles a copy for each shape
     params = jax.device_put(unflatten_dict(tensors, sep="/"))
     if calibration is not None:
         params[KEY] = calibration
@@ -136,7 +136,7 @@ def _calibration(note: str | None) -> Calibration | None:
     if note is None:
         return None
     calibration = Calibration.read(note)
-    # those of `align` are checked where they are known
+    # the clues of `align` are checked where they are known
     calibration.check("register", [field.name for field in dataclasses.fields(NetworkClues)])
     return calibration
 

@@ -1,9 +1,10 @@
-"""`register` as one file: a StableHLO program with its parameters inside, for hosts without this
+"""`register` as one file: a StableHLO program that includes its parameters, for hosts without this
 package.
 
-What is exported takes clouds of one capacity, padded, with their counts: XLA plans its memory for
-sizes that it knows, and the blocks in which neighbors are searched and features pooled are chosen
-by size. Padding changes no answer. The number of pairs may stay open (`batch=True`).
+The exported program takes clouds that are padded to a fixed capacity, with their point counts. The
+capacity is fixed because XLA plans its memory for known sizes, and because the blocks for neighbor
+search and feature pooling depend on the size. Padding does not change the results. The number of
+pairs can stay variable (`batch=True`).
 """
 
 from __future__ import annotations
@@ -40,22 +41,22 @@ def export_register(
 ) -> jax_export.Exported:
     """The program `(source, source_count, target, target_count) -> dict` for these platforms.
 
-    Clouds are (points, 3) float32, or (points, 6) with unit normals if `normals`; their first
-    `count` rows count (int32), the others may hold anything finite. As for `register`, both are
-    centered and of about unit size. The dict holds "transform" (4, 4), source onto target,
-    "transforms" (L, 4, 4), "weights" (points,) and "covered" (points,). With `batch` every
-    argument and result has one more axis in front, of any length. Counts below
-    `settings.neighbors` + 1 leave points with repeated neighbors.
+    Clouds are (points, 3) float32, or (points, 6) with unit normals if `normals` is True. Only
+    their first `count` rows (int32) are used; the others may hold any finite values. As for
+    `register`, both clouds must be centered and of about unit size. The dict holds "transform"
+    (4, 4), which maps source onto target, "transforms" (L, 4, 4), "weights" (points,) and "covered"
+    (points,). With `batch`, every argument and result has one more leading axis, of any length. If
+    a count is below `settings.neighbors` + 1, points have repeated neighbors.
 
-    Neighbors and missing normals are found inside, on the device. Parameters are constants of the
-    program. Differentiating an exported program is not supported. Raises ValueError for too few
-    points, and for unknown platforms.
+    The program finds neighbors and missing normals itself, on the device. Parameters are constants
+    of the program. An exported program cannot be differentiated. Raises ValueError for too few
+    points and for unknown platforms.
     """
     settings = Settings() if settings is None else settings
     if points < settings.neighbors + 1:
         raise ValueError(
-            f"points: got {points}, wanted at least {settings.neighbors + 1}, as each point has "
-            f"{settings.neighbors} neighbors"
+            f"points: got {points}, wanted at least {settings.neighbors + 1}, because each point "
+            f"has {settings.neighbors} neighbors"
         )
     unknown = [name for name in platforms if name not in PLATFORMS]
     if unknown or not platforms:
@@ -86,35 +87,38 @@ def export_register(
 
 
 def save_exported(path: str | os.PathLike[str], exported: jax_export.Exported) -> None:
-    """Writes the program, beside and then renamed."""
+    """Writes the program to a temporary file, then renames it to `path`."""
     write_atomically(path, bytes(exported.serialize()))
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportedRegister:
-    """An exported program, ready to be called with clouds of any size up to its capacity."""
+    """An exported program, which can be called with clouds of any size up to its capacity."""
 
     exported: jax_export.Exported
 
     @property
     def capacity(self) -> int:
-        """Most points of a cloud."""
+        """Largest number of points in a cloud."""
         return self.exported.in_avals[0].shape[-2]
 
     @property
     def channels(self) -> int:
-        """3, or 6 if clouds come with their normals."""
+        """3, or 6 if clouds have normals."""
         return self.exported.in_avals[0].shape[-1]
 
     @property
     def platforms(self) -> tuple[str, ...]:
-        """Where it runs."""
+        """The platforms that it runs on."""
         return tuple(self.exported.platforms)
 
     def __call__(self, source: ArrayLike, target: ArrayLike) -> dict[str, Array]:
-        """Registers one pair, (n, channels) and (m, channels) and of unit size, as `register` does;
-        "weights" and "covered" have the length of the clouds. Raises ValueError for clouds that do
-        not fit the program."""
+        """Registers one pair of unit-size clouds, (n, channels) and (m, channels), as `register`
+        does.
+
+        "weights" has length n and "covered" has length m. Raises ValueError for clouds that do not
+        fit the program.
+        """
         arguments = [part for cloud in self._padded(source, target) for part in cloud]
         batched = len(self.exported.in_avals[0].shape) == 3
         if batched:
@@ -133,22 +137,25 @@ class ExportedRegister:
                 raise ValueError(f"{name}: got shape {cloud.shape}, wanted (n, {self.channels})")
             if len(cloud) > self.capacity:
                 raise ValueError(
-                    f"{name}: got {len(cloud)} points, and the program was exported for at most "
+                    f"{name}: got {len(cloud)} points, but the program was exported for at most "
                     f"{self.capacity}"
                 )
             if not np.isfinite(cloud).all():
-                raise ValueError(f"{name}: holds values that are not finite")
+                raise ValueError(f"{name}: got values that are not finite, wanted finite ones")
             padded = np.pad(cloud, ((0, self.capacity - len(cloud)), (0, 0)))
             yield jnp.asarray(padded), jnp.asarray(len(cloud), jnp.int32)
 
 
 def load_exported(path: str | os.PathLike[str]) -> ExportedRegister:
-    """What `save_exported` (or `cfr export`) wrote. Raises ValueError for other files."""
+    """Reads a program that `save_exported` or `cfr export` wrote.
+
+    Raises ValueError for any other file.
+    """
     content = bytearray(Path(path).read_bytes())
     try:
         exported = jax_export.deserialize(content)
-    except Exception as error:  # flatbuffers reads past the end, or finds nonsense
-        raise ValueError(f"{path}: is no exported program: {type(error).__name__}") from error
+    except Exception as error:  # flatbuffers may read past the end or find nonsense
+        raise ValueError(f"{path} is not an exported program: {type(error).__name__}") from error
     if len(exported.in_avals) != 4:
-        raise ValueError(f"{path}: is an exported program, and not one of `register`")
+        raise ValueError(f"{path} is an exported program, but not one of `register`")
     return ExportedRegister(exported)

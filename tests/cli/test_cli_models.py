@@ -76,7 +76,7 @@ def test_a_card_of_other_weights_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(cards, "FOLDER", tmp_path)
 
     # when, then
-    with pytest.raises(ValueError, match="of other weights.*\n.*model_card.py object"):
+    with pytest.raises(ValueError, match="to other weights.*\n.*model_card.py object"):
         cards.read_card("object")
 
 

@@ -1,4 +1,4 @@
-"""Augmentation: each does what its field says, in the amount that it says, and nothing else."""
+"""Augmentations: each one does what its field says, in the stated amount, and nothing else."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ STILL = {"keep": (1.0, 1.0), "noise": (0.0, 0.0), "angle": 0.0, "translation": 0
 
 @pytest.fixture(scope="module")
 def sphere():
-    """400 points on the unit sphere, whose normals they are."""
+    """400 points on the unit sphere, which are also the normals."""
     points = np.random.default_rng(0).normal(size=(400, 3))
     return (points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
 
@@ -28,7 +28,7 @@ def drawn(sphere, sampling, seed=0, truth=None):
     return finish_pair(view, view, truth, sampling, np.random.default_rng(seed))
 
 
-def test_nothing_asked_for_changes_nothing(sphere):
+def test_without_augmentations_nothing_changes(sphere):
     pair = drawn(sphere, still())
 
     np.testing.assert_array_equal(pair["transform"], np.eye(4))
@@ -39,7 +39,7 @@ def test_nothing_asked_for_changes_nothing(sphere):
 
 
 @pytest.mark.parametrize(("seed", "centered"), [(0, 0.0), (1, 0.0), (2, 1.0), (3, 1.0)])
-def test_everything_together_leaves_the_truth_true(sphere, seed, centered):
+def test_with_all_augmentations_the_truth_is_still_right(sphere, seed, centered):
     truth = np.eye(4)
     truth[:3, :3] = Rotation.random(random_state=seed).as_matrix()
     truth[:3, 3] = 0.3, -0.2, 0.1
@@ -68,7 +68,7 @@ def test_orientation_turns_as_many_shapes_as_asked(sphere):
 
 
 def euler_angles(sphere, **changes):
-    """Of the motions of 300 pairs, degrees; the truth undoes what was done to the source."""
+    """Euler angles, in degrees, of the motions of 300 pairs. The truth undoes the motion."""
     made = [drawn(sphere, still(angle=45.0, **changes), seed)["transform"] for seed in range(300)]
     undone = [Rotation.from_matrix(transform[:3, :3].T) for transform in made]
     return np.array([rotation.as_euler("XYZ", degrees=True) for rotation in undone])
@@ -97,7 +97,7 @@ def test_centered_clouds_lie_about_their_centroids_as_often_as_asked(sphere):
 def test_near_shrinks_as_many_motions_as_asked(sphere):
     far, mixed, near = (euler_angles(sphere, near=share) for share in (0.0, 0.5, 1.0))
 
-    # the mean of an angle is 22.5, and of one shrunken by [0, 1] half of that
+    # the mean of an angle is 22.5, and half of that if it is scaled by a factor from [0, 1]
     for angles, wanted in ((far, 22.5), (mixed, 16.9), (near, 11.25)):
         assert abs(angles.mean() - wanted) < 2
     shift = [drawn(sphere, still(translation=0.5, near=1.0), seed) for seed in range(300)]
@@ -141,7 +141,7 @@ def test_sensor_noise_lies_along_the_rays_and_grows_with_distance_squared(sphere
         np.testing.assert_allclose(along[part].std(), wanted, rtol=0.1)
 
 
-def test_sensor_noise_stands_instead_of_the_other_in_its_share_of_pairs(sphere):
+def test_sensor_noise_replaces_the_other_noise_in_its_share_of_pairs(sphere):
     sampling = still(sensor_noise=0.5, sensor_scale=(0.01, 0.01))
 
     moved = [
@@ -159,7 +159,7 @@ def test_outliers_are_as_many_as_asked_and_fill_the_ball(sphere):
         out = np.abs(length - 1) > 1e-4
         assert 90 <= out.sum() <= 100  # of 400; one may fall on the sphere
         np.testing.assert_allclose(np.linalg.norm(pair[f"{side}_normals"], axis=1), 1, atol=1e-5)
-        # in a ball of radius 1 an eighth lies within a half
+        # in a unit ball, an eighth of the points lies within half the radius
         assert 0.04 < (length[out] < 0.55).mean() < 0.35
         assert length.max() < 1.2
 
@@ -172,7 +172,7 @@ def test_uneven_clouds_are_denser_on_one_side_by_the_factor_asked_for():
     rows = choose_rows(points, sampling, True, rng)
 
     assert len(np.unique(rows)) == 4000
-    # the direction is not known: it is that of the mean, by symmetry
+    # the direction is unknown, but by symmetry it is the direction of the mean
     axis = points[rows].mean(axis=0)
     axis /= np.linalg.norm(axis)
     height = points @ axis
@@ -185,7 +185,7 @@ def test_uneven_clouds_are_denser_on_one_side_by_the_factor_asked_for():
     assert np.linalg.norm(points[even].mean(axis=0)) < 0.05
 
 
-def test_too_few_points_are_all_there_before_any_comes_twice():
+def test_if_points_are_too_few_all_are_used_before_any_repeats():
     points = np.random.default_rng(0).normal(size=(10, 3))
     sampling = Sampling(points=24, neighbors=6)
 

@@ -13,14 +13,14 @@ CATEGORIES = ("chair", "lamp", "table")
 
 
 def knot(seed):
-    """Each of other proportions, so that few points tell them apart."""
+    """A knot whose proportions depend on `seed`, so that a few points distinguish the knots."""
     scale = (1.0, 0.25 + 0.06 * seed, 0.25 + 0.06 * (5 * seed % 12))
     return samples.knot(seed, 40, scale)
 
 
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory):
-    """Four shapes in each of three categories, and some that are no shapes."""
+    """Four shapes in each of three categories, and some meshes that are not fit."""
     folder = tmp_path_factory.mktemp("meshes")
     for seed in range(12):
         path = folder / CATEGORIES[seed % 3] / "deep" / f"{seed}.off"
@@ -57,7 +57,7 @@ def test_a_folder_becomes_three_splits(meshes, tmp_path):
         np.testing.assert_allclose(corpus.points.mean(axis=1), 0, atol=1e-3)
         radii = np.linalg.norm(corpus.points, axis=2).max(axis=1)
         np.testing.assert_allclose(radii, 1, atol=1e-3)
-    assert not list(tmp_path.glob(".*"))  # nothing of the work is left
+    assert not list(tmp_path.glob(".*"))  # no temporary files are left
 
 
 def test_points_lie_on_the_mesh_they_are_named_after(meshes, tmp_path):
@@ -69,15 +69,15 @@ def test_points_lie_on_the_mesh_they_are_named_after(meshes, tmp_path):
     corners = hull.vertices[hull.triangles]
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    # Each normal is one of the faces', and faces of one normal lie in one plane.
+    # Each normal is that of a face, and points with the same normal lie in one plane.
     face = np.argmax(normals @ outward.T, axis=1)
     np.testing.assert_allclose(normals, outward[face], atol=0.02)
     for one in np.unique(face):
         heights = points[face == one] @ outward[one]
-        assert np.ptp(heights) < 4e-3  # of half precision
+        assert np.ptp(heights) < 4e-3  # rounding to half precision
 
 
-def test_what_is_left_out_is_told_with_its_reason(meshes, tmp_path):
+def test_meshes_that_are_left_out_are_listed_with_their_reason(meshes, tmp_path):
     report = make(meshes, tmp_path / "corpus")
     assert report.left_out == {
         "lamp/broken.off": "cannot be read",
@@ -121,7 +121,7 @@ def test_an_interrupted_build_resumes_to_the_same_bytes(meshes, tmp_path, monkey
     assert contents(out) == contents(tmp_path / "whole")
 
 
-def test_changed_meshes_are_sampled_anew(meshes, tmp_path, monkeypatch):
+def test_changed_meshes_are_sampled_again(meshes, tmp_path, monkeypatch):
     out = tmp_path / "corpus"
     items = folder_items(meshes)
     monkeypatch.setattr(building, "drop_duplicates", lambda *_: 1 / 0)
@@ -150,7 +150,7 @@ def test_one_file_holds_all(meshes, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == beside
 
 
-def test_meshes_without_folders_are_of_one_category(tmp_path):
+def test_meshes_without_subfolders_form_one_category(tmp_path):
     (tmp_path / "things").mkdir()
     for seed in range(3):
         (tmp_path / "things" / f"{seed}.off").write_text(samples.off(knot(seed)))
@@ -164,7 +164,7 @@ def test_half_of_the_categories_are_unseen_whatever_their_order():
     assert choose_unseen(categories[::-1] * 2) == unseen
 
 
-def test_what_cannot_be_built_is_told(meshes, tmp_path):
+def test_a_build_that_is_impossible_is_refused_with_the_reason(meshes, tmp_path):
     with pytest.raises(ValueError, match="no folder"):
         folder_items(tmp_path / "none")
     with pytest.raises(ValueError, match="no mesh below"):
@@ -191,9 +191,9 @@ def test_builds_are_compared_by_name(meshes, tmp_path):
     found = compare(tmp_path / "here", tmp_path / "there")
     assert sum(found.common.values()) == 11
     assert found.renamed == {"table/deep/2.off": ["chair", "table"]}
-    # Lamps were the test there, tables are the test here, but for one that is a chair now.
+    # Lamps were the test there, and tables are the test here, except one that is now a chair.
     assert len(found.crossed) == 3 + 3
-    assert found.only_ours == {"lamp": 1}  # what repeated the lamp that is gone
+    assert found.only_ours == {"lamp": 1}  # it repeated the lamp that is now missing
     assert found.only_theirs == {
         "lamp": {"lamp/deep/4.off": "not in the sources, or of no category"}
     }

@@ -36,7 +36,7 @@ def street(rng):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A sequence whose recorded poses are off by up to 0.2 m and half a degree."""
+    """A sequence whose recorded poses have errors of up to 0.2 m and half a degree."""
     folder = tmp_path_factory.mktemp("kitti")
     rng = np.random.default_rng(0)
     scans = folder / "sequences" / "03" / "velodyne"
@@ -132,7 +132,7 @@ def test_scans_are_moved_up_to_fifteen_meters_and_45_degrees(folder):
         assert np.linalg.norm(motion[:3, 3]) > 1
 
 
-def test_truths_are_kept_in_the_cache_and_made_anew_for_other_settings(folder, tmp_path):
+def test_truths_are_cached_and_recomputed_for_other_settings(folder, tmp_path):
     cache = tmp_path / "deep" / "03.npz"
     first = read_pairs(folder, "03", cache, stride=1)
     written = cache.stat().st_mtime_ns
@@ -148,7 +148,7 @@ def test_truths_are_kept_in_the_cache_and_made_anew_for_other_settings(folder, t
         read_pairs(folder, "03", cache)
 
 
-def test_corrected_poses_are_not_answered_from_the_cache(folder, tmp_path):
+def test_corrected_poses_do_not_use_the_old_cache(folder, tmp_path):
     moved = shutil.copytree(folder, tmp_path / "moved")
     first = read_pairs(moved, "03", tmp_path / "03.npz")
     (moved / "sequences" / "03" / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
@@ -159,7 +159,7 @@ def test_corrected_poses_are_not_answered_from_the_cache(folder, tmp_path):
     assert len(again) == 0 or not np.array_equal(again.transforms, first.transforms)
 
 
-def test_what_is_missing_or_broken_is_told(folder, tmp_path):
+def test_missing_or_broken_files_are_named(folder, tmp_path):
     with pytest.raises(ValueError, match="no .*07.txt.*cvlibs"):
         read_pairs(folder, "07")
     with pytest.raises(ValueError, match="no scan at .*000099.bin"):
@@ -171,5 +171,5 @@ def test_what_is_missing_or_broken_is_told(folder, tmp_path):
         kitti.read_frame(tmp_path, "00", 0)
     (tmp_path / "poses").mkdir()
     (tmp_path / "poses" / "00.txt").write_text("1 2 3\n")
-    with pytest.raises(ValueError, match="wanted 12 numbers a line"):
+    with pytest.raises(ValueError, match="wanted 12 numbers per line"):
         read_poses(tmp_path, "00")

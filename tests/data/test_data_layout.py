@@ -1,4 +1,4 @@
-"""Data told by their layout, and which pairs are in them."""
+"""Data is recognized by its layout, and its pairs are found."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def clouds(folder, *names):
 
 
 def make(kind, folder):
-    """Data of one kind, as small as they come; what to hand over."""
+    """The path of minimal data of one kind."""
     match kind:
         case "pair-list":
             clouds(folder, "a.ply", "b.ply")
@@ -59,7 +59,7 @@ def make(kind, folder):
 
 
 @pytest.mark.parametrize("kind", [kind.name for kind in kinds.known()])
-def test_every_kind_is_recognized_and_told(kind, tmp_path):
+def test_every_kind_is_recognized_and_described(kind, tmp_path):
     found = recognize(make(kind, tmp_path))
     assert found.kind.name == kind and str(tmp_path) in str(found)
     told = {
@@ -83,7 +83,7 @@ def test_a_folder_of_ply_is_clouds_or_meshes_as_its_headers_say(tmp_path):
     assert recognize(clouds(tmp_path / "c", "a.ply")).kind.name == "clouds"
 
 
-def test_a_readme_among_meshes_makes_no_folder_of_clouds(tmp_path):
+def test_a_readme_among_meshes_does_not_make_a_folder_of_clouds(tmp_path):
     for name in ("a.stl", "b.obj", "readme.txt"):
         (tmp_path / name).write_text("")
 
@@ -91,10 +91,10 @@ def test_a_readme_among_meshes_makes_no_folder_of_clouds(tmp_path):
     assert recognize(tmp_path, "clouds").found == "1 point clouds (.txt)"
 
 
-def test_the_kind_can_be_overruled_but_has_to_fit(tmp_path):
+def test_the_kind_can_be_given_but_must_fit(tmp_path):
     make("clouds", tmp_path)
     assert recognize(tmp_path, "clouds").kind.name == "clouds"
-    with pytest.raises(ValueError, match="not laid out as kitti: it holds 2 .ply, 1 .pcd"):
+    with pytest.raises(ValueError, match="does not have the layout of kitti: it holds 2 .ply, 1"):
         recognize(tmp_path, "kitti")
     with pytest.raises(ValueError, match="layout: got 'photos', wanted one of pair-list"):
         recognize(tmp_path, "photos")
@@ -104,7 +104,7 @@ def test_the_kind_can_be_overruled_but_has_to_fit(tmp_path):
     ("name", "said"),
     [("none", "no file or folder"), ("empty", "holds nothing"), ("photos", "holds 1 .jpg")],
 )
-def test_what_is_not_recognized_is_told_with_what_is_there(name, said, tmp_path):
+def test_unrecognized_data_is_refused_with_what_is_there(name, said, tmp_path):
     for folder in ("empty", "photos"):
         (tmp_path / folder).mkdir()
     (tmp_path / "photos/a.jpg").touch()
@@ -116,13 +116,13 @@ def names(jobs):
     return [(job.source, job.target) for job in jobs]
 
 
-def test_loose_clouds_are_laid_on_the_one_before_in_the_order_people_count(tmp_path):
+def test_loose_clouds_are_paired_with_the_previous_one_in_natural_order(tmp_path):
     jobs, how = jobs_of(recognize(make("clouds", tmp_path)))
     assert names(jobs) == [("scan2.pcd", "scan1.ply"), ("scan10.ply", "scan2.pcd")]
     assert "before it" in how
 
 
-def test_names_say_what_is_source_and_what_target(tmp_path):
+def test_names_say_which_cloud_is_source_and_which_is_target(tmp_path):
     clouds(tmp_path, "b_target.ply", "a_source.ply", "b_source.ply", "a_target.ply")
     jobs, how = jobs_of(recognize(tmp_path))
     assert names(jobs) == [("a_source.ply", "a_target.ply"), ("b_source.ply", "b_target.ply")]
@@ -152,8 +152,8 @@ def test_pairs_of_a_file_are_read_one_by_one(tmp_path):
     assert np.array_equal(target.points, source.points + 1)
 
 
-def test_shapes_are_no_pairs(tmp_path):
-    with pytest.raises(ValueError, match="no pairs\n.*evaluate.py"):
+def test_shapes_are_not_pairs(tmp_path):
+    with pytest.raises(ValueError, match="not pairs\n.*evaluate.py"):
         jobs_of(recognize(make("corpus", tmp_path)))
 
 

@@ -1,4 +1,4 @@
-"""Training pairs: each a function of seed and position alone, and each what it says it is."""
+"""Training pairs: each depends only on seed and position, and each has the stated properties."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def test_the_pairs_are_the_same_whatever_the_number_of_workers(source, workers):
     assert_same(stream(source, 0, 7, workers=workers), stream(source, 0, 7))
 
 
-def test_a_resumed_stream_goes_on_where_it_stopped(source):
+def test_a_resumed_stream_continues_where_it_stopped(source):
     whole = stream(source, 0, 6)
 
     assert_same(stream(source, 8, 2), whole[4:])
@@ -88,13 +88,13 @@ def test_several_processes_make_the_shares_of_the_same_batches(source):
     assert_same(joined, whole)
 
 
-def test_no_worker_is_refused(source):
+def test_zero_workers_are_refused(source):
     with pytest.raises(ValueError, match="workers: got 0"):
         stream(source, 0, 1, workers=0)
 
 
 class Listed(TrainingSource):
-    """A source that tells which of its items are drawn."""
+    """A source that records which of its items are drawn."""
 
     noun, stamp, recorded, check = "items", "the same", frozenset(), None
 
@@ -109,7 +109,7 @@ class Listed(TrainingSource):
         return {"a": np.zeros(1)}
 
 
-def test_every_shape_comes_once_an_epoch_in_an_order_of_its_own():
+def test_every_shape_comes_once_per_epoch_in_a_new_order():
     source = Listed(5)
 
     batch_at(source, 0, 15, SMALL, seed=0)
@@ -119,7 +119,7 @@ def test_every_shape_comes_once_an_epoch_in_an_order_of_its_own():
     assert len({tuple(epoch) for epoch in epochs}) > 1
 
 
-def test_a_mixture_repeats_each_source_as_often_as_told():
+def test_a_mixture_repeats_each_source_as_often_as_configured():
     few, many, out = Listed(2), Listed(5), Listed(3)
     mixture = Mixture([few, out, many], [3, 0, 1])
 
@@ -136,7 +136,7 @@ def test_another_seed_gives_other_pairs(source):
     assert (here[0]["source"] != there[0]["source"]).all()
 
 
-def test_the_truth_carries_the_source_onto_the_shape_of_the_target(source, corpus):
+def test_the_truth_maps_the_source_onto_the_shape_of_the_target(source, corpus):
     sampling = Sampling(points=60, neighbors=6, keep=(1.0, 1.0))
 
     for seed in range(5):

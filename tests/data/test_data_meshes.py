@@ -4,7 +4,7 @@ import mesh_samples as samples
 import numpy as np
 import pytest
 
-from cfr_jax.data.making.furniture import CATALOGUE, FurnitureLibrary
+from cfr_jax.data.making.furniture import CATALOG, FurnitureLibrary
 from cfr_jax.data.making.mesh_formats import mesh_formats
 from cfr_jax.data.making.meshes import parse_ac3d, parse_pmd, read_mesh
 from cfr_jax.io.formats import by_suffix
@@ -26,7 +26,7 @@ def test_pmd_gives_the_triangles_whatever_the_texture_coordinates(sets):
     np.testing.assert_array_equal(mesh.triangles, KNOT.triangles)
 
 
-def test_pmd_faces_turn_to_agree_with_the_normals_of_their_vertices():
+def test_pmd_faces_are_wound_to_agree_with_the_normals_of_their_vertices():
     flipped = type(KNOT)(KNOT.vertices, KNOT.triangles[:, ::-1].copy(), "flipped")
     assert volume(flipped) < 0 < volume(KNOT)
     mesh = parse_pmd(samples.pmd(flipped, OUTWARD), "flipped")
@@ -36,7 +36,7 @@ def test_pmd_faces_turn_to_agree_with_the_normals_of_their_vertices():
 @pytest.mark.parametrize(
     "damage, message",
     [
-        (lambda data: data[:10], "no PMD file"),
+        (lambda data: data[:10], "got 10 bytes, wanted a PMD file"),
         (lambda data: b"PSMB" + data[4:], "b'PSMB'"),
         (lambda data: data[:4] + b"\3" + data[5:], "version 3"),
         (lambda data: data[:500], "ends within its 30 vertices"),
@@ -112,7 +112,7 @@ def test_ac3d_places_objects_by_the_tree_and_leaves_lines_out(end):
     assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2], [4, 5, 6]]
 
 
-def test_ac3d_may_promise_more_children_than_come():
+def test_ac3d_may_declare_more_children_than_it_has():
     text = samples.ac3d(KNOT).replace("kids 1", "kids 3", 1)
     mesh = parse_ac3d(text.encode(), "knot")
     np.testing.assert_array_equal(mesh.vertices, KNOT.vertices)
@@ -152,13 +152,13 @@ def test_every_kind_of_file_gives_the_same_mesh(tmp_path):
         np.testing.assert_array_equal(mesh.triangles, KNOT.triangles)
 
 
-def test_what_is_no_mesh_is_refused(tmp_path):
+def test_a_file_that_is_not_a_mesh_is_refused(tmp_path):
     cloud = tmp_path / "cloud.ply"
     header = "ply\nformat ascii 1.0\nelement vertex 1\n"
     cloud.write_text(
         header + "".join(f"property float {a}\n" for a in "xyz") + "end_header\n0 0 0\n"
     )
-    with pytest.raises(ValueError, match="is a point cloud, wanted a mesh"):
+    with pytest.raises(ValueError, match="got a point cloud, wanted a mesh"):
         read_mesh(cloud)
     with pytest.raises(ValueError, match="unknown suffix '.jpg'"):
         read_mesh(tmp_path / "cloud.jpg")
@@ -172,7 +172,7 @@ def test_a_furniture_library_gives_pieces_at_their_true_size(tmp_path):
     with FurnitureLibrary(path) as library:
         chair, bed = library.pieces
         assert (chair.identifier, chair.name, chair.category) == ("Lib#chair", "Ch\xe4ir", "Seats")
-        assert bed.size == (2.0, 1.0, 0.505)  # width, height, depth: centimeters in the catalogue
+        assert bed.size == (2.0, 1.0, 0.505)  # width, height, depth: centimeters in the catalog
         mesh = library.mesh(chair)
     np.testing.assert_array_equal(mesh.triangles, KNOT.triangles)
     scaled = chair.scaled(mesh)
@@ -187,7 +187,7 @@ def test_a_model_may_be_a_zip_in_the_zip(tmp_path):
         archive.writestr("deep/model.obj", samples.obj(KNOT))
     entry = "name#7=A\nmodel#7=/m.zip\nwidth#7=1\ndepth#7=1\nheight#7=1\nid#7=x\\u00e9\\:y\n"
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(CATALOGUE, entry)
+        archive.writestr(CATALOG, entry)
         archive.write(inner, "m.zip")
     with FurnitureLibrary(path) as library:
         (piece,) = library.pieces
@@ -196,25 +196,25 @@ def test_a_model_may_be_a_zip_in_the_zip(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "catalogue, message",
+    "catalog, message",
     [
         (None, "not a furniture library"),
         ("name#1=A\nmodel#1=/m.obj\n", "lacks \\['width', 'depth', 'height'\\]"),
-        ("name#1=A\nmodel#1=/m\nwidth#1=wide\ndepth#1=1\nheight#1=1\n", "no number"),
+        ("name#1=A\nmodel#1=/m\nwidth#1=wide\ndepth#1=1\nheight#1=1\n", "not a number"),
     ],
 )
-def test_a_damaged_library_is_refused(tmp_path, catalogue, message):
+def test_a_damaged_library_is_refused(tmp_path, catalog, message):
     path = tmp_path / "library.sh3f"
     with zipfile.ZipFile(path, "w") as archive:
-        if catalogue is not None:
-            archive.writestr(CATALOGUE, catalogue)
+        if catalog is not None:
+            archive.writestr(CATALOG, catalog)
     with pytest.raises(ValueError, match=message):
         FurnitureLibrary(path)
 
 
-def test_a_missing_model_is_told_when_it_is_asked_for(tmp_path):
+def test_a_missing_model_is_reported_when_it_is_read(tmp_path):
     path = tmp_path / "library.sh3f"
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(CATALOGUE, "name#1=A\nmodel#1=m.obj\nwidth#1=1\ndepth#1=1\nheight#1=1\n")
+        archive.writestr(CATALOG, "name#1=A\nmodel#1=m.obj\nwidth#1=1\ndepth#1=1\nheight#1=1\n")
     with FurnitureLibrary(path) as library, pytest.raises(ValueError, match="cannot read m.obj"):
         library.mesh(library.pieces[0])

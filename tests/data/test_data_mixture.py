@@ -1,4 +1,4 @@
-"""Training data by name: shapes, pairs of scans, drives, single scans, and mixtures of them."""
+"""Training data by name: shapes, pairs of scans, drives, single scans, and mixtures."""
 
 from pathlib import Path
 
@@ -53,21 +53,21 @@ def pairs_file(tmp_path_factory, surface, motion):
     return path
 
 
-def test_the_truth_of_a_drawn_pair_lays_one_scan_on_the_other(pairs_file):
+def test_the_truth_of_a_drawn_pair_aligns_its_scans(pairs_file):
     source = pair_file.train(pairs_file, NO_CACHE)
 
     for seed in range(3):
         pair = source.draw(1, WHOLE, np.random.default_rng(seed))
 
         moved = pieces.move(pair["transform"].astype(np.float64), pair["source"])
-        # thinned each on its own, the two share many points, but not all
+        # thinned separately, the two share many points, but not all
         gap = np.linalg.norm(moved[:, None] - pair["target"], axis=-1).min(axis=1)
         assert (gap < 1e-4).mean() > 0.1 and np.median(gap) < 0.25
         assert np.linalg.norm(pair["target"], axis=1).max() < 1.6
         assert pair["estimate_normals"] and pair["source"].shape == (60, 3)
 
 
-def test_a_pair_with_all_its_points_is_laid_exactly(pairs_file):
+def test_a_pair_with_all_its_points_is_aligned_exactly(pairs_file):
     sampling = Sampling(
         points=300, neighbors=6, keep=(1.0, 1.0), noise=(0.0, 0.0), any_orientation=1.0,
         scale=(0.5, 2.0),
@@ -102,11 +102,11 @@ def test_scans_that_are_validated_on_must_not_be_trained_on(pairs_file, tmp_path
         return mixtures.open_mixture({"room": about}, tmp_path, "data.train")
 
     mixtures.check_apart(opened((0, 6)), opened((6, 12)))
-    with pytest.raises(ValueError, match="2 of its 6 scans are in data.train, too"):
+    with pytest.raises(ValueError, match="2 of its 6 scans are also in data.train"):
         mixtures.check_apart(opened((0, 8)), opened((6, 12)))
 
 
-def test_single_scans_make_pairs_of_their_own(tmp_path, surface):
+def test_a_single_scan_gives_pairs_of_two_views(tmp_path, surface):
     for name in ("a.ply", "b.xyz"):
         io.write(tmp_path / name, io.PointCloud(surface))
 
@@ -120,7 +120,7 @@ def test_single_scans_make_pairs_of_their_own(tmp_path, surface):
     assert 0.3 < (gap < 1e-3).mean() < 0.95  # each is a crop of its own
 
 
-def test_a_list_of_files_trains_too_and_needs_truths(tmp_path, surface, motion):
+def test_a_list_of_files_can_be_trained_on_and_needs_truths(tmp_path, surface, motion):
     io.write(tmp_path / "target.ply", io.PointCloud(surface))
     io.write(tmp_path / "source.ply", io.PointCloud((surface - motion[:3, 3]) @ motion[:3, :3]))
     numbers = ",".join(map(repr, motion.ravel().tolist()))
@@ -166,14 +166,14 @@ def test_a_drive_gives_pairs_at_several_distances_within_its_frames(drive, tmp_p
                             "00/000000-000003", "00/000002-000005")  # fmt: skip
     pair = source.draw(0, WHOLE, np.random.default_rng(0))
     moved = pieces.move(pair["transform"].astype(np.float64), pair["source"])
-    # 4 m of 20 m: without the truth the two would lie a fifth of a radius apart
+    # 4 m of 20 m: without the true motion, the two would be a fifth of a radius apart
     everything = source.read(0)
     truth = everything.transform
     np.testing.assert_allclose(truth[:3, 3], [-4, 0, 0], atol=0.1)
     assert np.isfinite(moved).all() and len(list(tmp_path.glob("truths_00_*.npz"))) == 2
 
 
-def test_of_a_single_scan_two_views_are_validated_on_and_a_recorded_pair_as_it_is(
+def test_validation_draws_two_views_of_a_single_scan_and_keeps_a_recorded_pair(
     pairs_file, tmp_path, surface
 ):
     io.write(tmp_path / "a.ply", io.PointCloud(surface))
@@ -220,7 +220,7 @@ def test_scans_of_too_few_points_are_named_before_any_training(tmp_path, surface
     scans = tmp_path / "scans"
     scans.mkdir()
     io.write(scans / "good.ply", io.PointCloud(surface))
-    for folder in ("a", "b"):  # of one name, they are two
+    for folder in ("a", "b"):  # two different files with the same name
         (scans / folder).mkdir()
         io.write(scans / folder / "few.ply", io.PointCloud(surface[:3]))
     io.write(scans / "same.ply", io.PointCloud(np.ones((500, 3))))
@@ -239,11 +239,11 @@ def test_a_pair_that_cannot_be_drawn_is_named():
     pair = Pair("heap.ply", heap, heap, transform=np.eye(4))
     source = scenes.SceneSource(("a/heap.ply",), (("a", "a"),), lambda _: pair, "stamp")
 
-    with pytest.raises(ValueError, match="^a/heap.ply: .*all are alike"):
+    with pytest.raises(ValueError, match="^a/heap.ply: .*do not coincide"):
         source.draw(0, WHOLE, np.random.default_rng(0))
 
 
-def test_of_a_scan_of_many_points_only_some_are_held(tmp_path):
+def test_only_some_points_of_a_large_scan_are_kept_in_memory(tmp_path):
     rng = np.random.default_rng(0)
     points = rng.normal(size=(3 * scenes._MOST, 3))
     io.write(tmp_path / "big.ply", io.PointCloud(points, normals=points))
@@ -253,11 +253,11 @@ def test_of_a_scan_of_many_points_only_some_are_held(tmp_path):
     assert pair.source.shape == pair.source_normals.shape == (scenes._MOST, 3)
     directions = pair.source / np.linalg.norm(pair.source, axis=1, keepdims=True)
     alike = np.einsum("ni,ni->n", directions, pair.source_normals)
-    assert (alike > 0.99).all()  # each point keeps its own
+    assert (alike > 0.99).all()  # each point keeps its own normal
     assert pair.target is pair.source
 
 
-def test_the_stamp_of_data_goes_by_what_they_are_and_not_by_where_they_lie(tmp_path, surface):
+def test_the_stamp_depends_on_the_data_and_not_on_its_path(tmp_path, surface):
     def stamp(folder, clouds, repeat=1):
         (tmp_path / folder).mkdir()
         for name, cloud in clouds.items():
@@ -273,7 +273,7 @@ def test_the_stamp_of_data_goes_by_what_they_are_and_not_by_where_they_lie(tmp_p
     assert stamp("twice", {"a.ply": surface}, repeat=2) != first
 
 
-def test_lists_share_a_scan_where_they_name_one_file(tmp_path, surface, motion):
+def test_lists_that_name_the_same_file_share_a_scan(tmp_path, surface, motion):
     for name in ("a.ply", "b.ply", "c.ply"):
         io.write(tmp_path / name, io.PointCloud(surface))
     numbers = ",".join(map(repr, motion.ravel().tolist()))
@@ -284,15 +284,15 @@ def test_lists_share_a_scan_where_they_name_one_file(tmp_path, surface, motion):
         about = {"kind": "pair-list", "path": str(tmp_path / name)}
         return mixtures.open_mixture({"a": about}, tmp_path, "data.train")
 
-    with pytest.raises(ValueError, match="1 of its 2 scans are in data.train, too"):
+    with pytest.raises(ValueError, match="1 of its 2 scans are also in data.train"):
         mixtures.check_apart(opened("train.csv"), opened("val.csv"))
     about = {"kind": "clouds", "path": str(tmp_path)}
     folder = mixtures.open_mixture({"a": about}, tmp_path, "data.validation")
-    with pytest.raises(ValueError, match="2 of its 3 scans are in data.train, too"):
+    with pytest.raises(ValueError, match="2 of its 3 scans are also in data.train"):
         mixtures.check_apart(opened("train.csv"), folder)
 
 
-def test_named_sources_are_mixed_as_often_as_told(pairs_file, tmp_path):
+def test_named_sources_are_mixed_as_often_as_configured(pairs_file, tmp_path):
     mixture = mixtures.open_mixture(
         dict(
             room={"kind": "pair-file", "path": str(pairs_file), "repeat": 3},
@@ -321,14 +321,14 @@ def test_validation_pairs_are_the_same_every_time(pairs_file, tmp_path):
     ("about", "wanted"),
     [
         ({"kind": "video", "path": "a"}, "kind: got 'video'"),
-        ({"kind": "clouds", "path": "nowhere"}, "no folder of scans at nowhere"),
+        ({"kind": "clouds", "path": "nowhere"}, "path: there is no folder of scans at nowhere"),
         ({"kind": "clouds", "path": "a", "frames": (0, 1)}, "clouds got .*frames.*wanted path"),
-        ({"kind": "pair-list"}, "data.train.mine.path: none given"),
-        ({"kind": "clouds", "path": ""}, "data.train.mine.path: none given"),
+        ({"kind": "pair-list"}, "data.train.mine.path: got none, wanted a file or a folder"),
+        ({"kind": "clouds", "path": ""}, "data.train.mine.path: got none"),
         ({"kind": "pair-list", "path": "a", "repeat": -1}, "repeat: got -1"),
         ({"kind": "pair-list", "path": "a", "repeat": 0}, "no source"),
     ],
 )
-def test_what_a_source_has_wrong_is_named(tmp_path, about, wanted):
+def test_a_wrong_entry_of_a_source_is_named(tmp_path, about, wanted):
     with pytest.raises(ValueError, match=wanted):
         mixtures.open_mixture({"mine": about}, tmp_path, "data.train")

@@ -9,9 +9,9 @@ CATEGORIES = [f"kind_{letter}{number}" for letter in "abcd" for number in range(
 
 @pytest.fixture
 def folder(tmp_path):
-    """As unpacked: each half in two files, one shape of each category a file, points = label."""
+    """The unpacked folder: two files per half, each with one shape per category, points = label."""
     rng = np.random.default_rng(0)
-    listed = rng.permutation(40)  # the alphabet, not the line number, decides what is seen
+    listed = rng.permutation(40)  # alphabetical order, not the line number, decides what is seen
     (tmp_path / "shape_names.txt").write_text("".join(f"{CATEGORIES[i]}\n" for i in listed))
     for half, offset in (("train", 0), ("test", 1000)):
         lines = []

@@ -27,7 +27,7 @@ def game_mesh(seed):
 
 @pytest.fixture(scope="module")
 def debs(tmp_path_factory):
-    """The four packages, with a mesh or two of a few categories."""
+    """The four packages, with one or two meshes from a few categories."""
     folder = tmp_path_factory.mktemp("debs")
     game = folder / "public.zip"
     with zipfile.ZipFile(game, "w") as archive:
@@ -96,7 +96,7 @@ def test_the_packages_become_a_corpus_of_seen_and_unseen_shapes(debs, tmp_path):
     assert "0ad:gaia/oak2\trepeats 0ad:gaia/oak1\n" in (out / "left_out.tsv").read_text()
     assert "CC-BY-SA-3.0" in (out / "CREDITS.md").read_text()
     assert (out / "unseen_categories.txt").read_text().split() == list(UNSEEN)
-    # All categories are listed, of few packages too, so that labels mean the same everywhere.
+    # All categories are always listed, so that labels mean the same everywhere.
     assert len((out / "shape_names.txt").read_text().split()) == 45
     assert sorted(path.name for path in tmp_path.iterdir()) == ["open_cad"]
 
@@ -115,12 +115,12 @@ def test_the_same_packages_give_the_same_bytes_also_after_an_interruption(
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
 
 
-def test_a_package_that_is_not_there_is_told(debs, tmp_path):
+def test_a_missing_package_is_named(debs, tmp_path):
     with pytest.raises(ValueError, match="--debs: no 0ad-data_\\*.deb in"):
         build_open_cad(tmp_path / "out", tmp_path, quiet=True)
 
 
-def test_a_package_without_its_files_is_told(tmp_path):
+def test_a_package_without_its_files_is_refused(tmp_path):
     samples.deb(tmp_path / "0ad-data_9_all.deb", {"usr/share/other": b"x"})
     with pytest.raises(ValueError, match="holds no file like .*another version"):
         build_open_cad(tmp_path / "out", tmp_path, quiet=True)
@@ -129,7 +129,7 @@ def test_a_package_without_its_files_is_told(tmp_path):
 @pytest.mark.parametrize(
     "source, path, category",
     [
-        # A shield on a tower is a shield, the tower under construction a pile of rubble.
+        # A shield on a tower is a shield, and a tower under construction is a pile of rubble.
         ("0ad", "props/maur_scout_tower_shields_bell", "shield"),
         ("0ad", "structural/kart_defense_tower_foundation", "rubble_pile"),
         ("0ad", "structural/kart_wooden_tower", "tower"),

@@ -18,13 +18,13 @@ def test_wanted_files_are_extracted(tmp_path, packed):
     assert not (tmp_path / "out/usr/other").exists()
 
 
-def test_what_is_there_already_is_kept(tmp_path):
+def test_files_that_are_already_there_are_kept(tmp_path):
     samples.deb(tmp_path / "p_1_all.deb", FILES)
     (first,) = extract(tmp_path / "p_1_all.deb", lambda name: name.endswith("a.txt"), tmp_path)
     before = first.stat().st_mtime_ns
     extract(tmp_path / "p_1_all.deb", lambda name: name.endswith("a.txt"), tmp_path)
     assert first.stat().st_mtime_ns == before
-    first.write_bytes(b"cut")  # of the same size: kept; of another: written again
+    first.write_bytes(b"cut")  # a file of the same size is kept, any other is written again
     first.write_bytes(b"cu")
     extract(tmp_path / "p_1_all.deb", lambda name: name.endswith("a.txt"), tmp_path)
     assert first.read_bytes() == b"one"
@@ -42,9 +42,9 @@ def test_a_package_cannot_write_outside_of_the_folder(tmp_path):
     [
         (lambda data: b"PK" + data[2:], "not a Debian package"),
         (lambda data: data[:100], "holds no data.tar, or is cut off"),
-        (lambda data: data[:-60], "is cut off: data.tar.xz wants"),
-        (lambda data: data[:-120] + b"\1" * 120, "not a whole Debian package"),
-        (lambda data: data.replace(b"data.tar.xz ", b"data.tar.zst"), "packed in a way"),
+        (lambda data: data[:-60], "is cut off: data.tar.xz should have"),
+        (lambda data: data[:-120] + b"\1" * 120, "not a complete Debian package"),
+        (lambda data: data.replace(b"data.tar.xz ", b"data.tar.zst"), "has a compression that"),
     ],
 )
 def test_a_damaged_package_is_refused(tmp_path, damage, message):
@@ -79,13 +79,13 @@ def test_apt_is_asked_once(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["tool_1%3a2_all.deb"]
 
 
-def test_without_apt_the_way_out_is_told(tmp_path, monkeypatch):
+def test_without_apt_the_message_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setattr(packages.shutil, "which", lambda _: None)
     with pytest.raises(ValueError, match="packages.debian.org/tool .*--debs"):
         download("tool", tmp_path)
 
 
-def test_what_apt_complains_of_is_told(tmp_path, monkeypatch):
+def test_the_error_of_apt_is_passed_on(tmp_path, monkeypatch):
     monkeypatch.setattr(packages.shutil, "which", lambda _: "/usr/bin/apt-get")
     failed = subprocess.CompletedProcess([], 100, "", "E: Unable to locate package tool\n")
     monkeypatch.setattr(packages.subprocess, "run", lambda *_, **__: failed)

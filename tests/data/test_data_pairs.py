@@ -13,7 +13,7 @@ WRITTEN = ",".join(map(str, TRUTH.ravel()))
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two clouds as text in a folder of their own."""
+    """A folder with two clouds as text files."""
     rng = np.random.default_rng(0)
     (tmp_path / "clouds").mkdir()
     for name in ("a", "b"):
@@ -60,7 +60,7 @@ def test_a_list_is_checked_before_any_cloud_is_read(folder):
     ("line", "message"),
     [
         ("a.ply", "line 2: wanted `source,target`"),
-        ("a.ply,b.ply,1,0,0", "line 2: 3 numbers after the two files, wanted 16"),
+        ("a.ply,b.ply,1,0,0", "line 2: got 3 numbers after the two files, wanted 16"),
         ("a.ply,b.ply" + ",x" * 16, "line 2: could not convert.*wanted 16 numbers"),
         ("a.ply,b.ply" + ",2" * 16, "line 2: transform: got .*not rigid"),
         ("a.ply,b.ply" + ",nan" * 16, "line 2: transform: got .*finite"),
@@ -132,16 +132,16 @@ def test_a_bad_group_is_named(tmp_path, held, message):
         Hdf5Pairs(tmp_path / "pairs.h5")[0]
 
 
-def test_what_is_no_list_of_pairs_is_refused(tmp_path):
+def test_a_file_that_is_not_a_list_of_pairs_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no file of pairs at"):
         CsvPairs(tmp_path / "absent.csv")
     (tmp_path / "empty.csv").write_text("source,target\n")
-    with pytest.raises(ValueError, match="lists no pair"):
+    with pytest.raises(ValueError, match="lists no pairs"):
         CsvPairs(tmp_path / "empty.csv")
     (tmp_path / "noise.csv").write_bytes(bytes(range(255, 0, -1)))
-    with pytest.raises(ValueError, match="no list in CSV"):
+    with pytest.raises(ValueError, match="is not a CSV list"):
         CsvPairs(tmp_path / "noise.csv")
     with h5py.File(tmp_path / "flat.h5", "w") as file:
         file["data"] = np.ones(3)
-    with pytest.raises(ValueError, match="holds no group"):
+    with pytest.raises(ValueError, match="has no groups"):
         Hdf5Pairs(tmp_path / "flat.h5")

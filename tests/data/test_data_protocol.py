@@ -25,7 +25,7 @@ def corpus_of(shapes=4, points=2048, seed=0):
 
 
 def published_draws(shape, index, kind, count=1024):
-    """Section by section the published test procedure, with numpy's global legacy functions."""
+    """The published test procedure, section by section, with numpy's global legacy functions."""
 
     def half_space(cloud, share):
         phi, c = np.random.uniform(0.0, 2 * np.pi), np.random.uniform(-1.0, 1.0)
@@ -148,15 +148,15 @@ def test_euler_angles_and_translations_fill_their_ranges():
     np.testing.assert_allclose(np.linalg.det(motions), 1, atol=1e-6)
 
 
-def test_both_ways_are_the_same_pairs_turned_either_way():
-    # given the same shape, turned by angles from [0, 45] and by those from [-45, 45]
+def test_both_ways_gives_the_same_pairs_turned_either_way():
+    # given the same shape, rotated by angles from [0, 45] and by angles from [-45, 45]
     corpus = corpus_of()
     one_way, both_ways = (
         fixed_pair(corpus, 1, protocol)
         for protocol in (protocols.partial, protocols.partial_both_ways)
     )
 
-    # then each angle drawn is another share of its range, and nothing else changes
+    # then each angle is mapped to the other range, and nothing else changes
     def angles(pair):
         undone = Rotation.from_matrix(pair.transform[:3, :3].T)
         return undone.as_euler("XYZ", degrees=True)
@@ -171,7 +171,7 @@ def test_any_rotation_is_drawn_uniformly(legacy):
 
     motions = np.array([protocols.random_motion(None, 0.5, rng) for _ in range(4000)], np.float64)
 
-    # of uniform rotations each entry has mean 0 and variance 1/3, the angle mean pi / 2 + 2 / pi
+    # for uniform rotations, entries have mean 0 and variance 1/3, angles the mean pi / 2 + 2 / pi
     rotations = motions[:, :3, :3]
     np.testing.assert_allclose(rotations.mean(axis=0), 0, atol=0.04)
     np.testing.assert_allclose(rotations.var(axis=0), 1 / 3, atol=0.02)
@@ -198,11 +198,11 @@ def test_too_few_points_are_all_used_before_any_is_repeated():
 
 
 def test_impossible_requests_are_refused_by_name():
-    with pytest.raises(ValueError, match="keep is 1.5"):
+    with pytest.raises(ValueError, match="keep: got 1.5"):
         Protocol("x", keep=1.5)
-    with pytest.raises(ValueError, match="points is 0"):
+    with pytest.raises(ValueError, match="points: got 0"):
         Protocol("x", points=0)
-    with pytest.raises(ValueError, match="index is 9"):
+    with pytest.raises(ValueError, match="index: got 9, wanted 0 to"):
         fixed_pair(corpus_of(), 9, protocols.clean)
     with pytest.raises(ValueError, match="leaves none of 8 points"):
         protocols.crop(np.zeros((8, 3), np.float32), 0.7, np.random.default_rng(0))

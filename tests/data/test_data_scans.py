@@ -37,7 +37,7 @@ def test_voxels_hold_the_mean_of_their_points():
     assert thinned.dtype == np.float32
 
 
-def test_a_voxel_far_from_home_keeps_its_millimeters():
+def test_a_voxel_far_from_the_origin_keeps_its_millimeters():
     points = np.array([[5e6, 4e5, 100.0], [5e6 + 0.002, 4e5, 100.0]])
 
     np.testing.assert_allclose(voxel_mean(points, 0.3), [[5e6 + 0.001, 4e5, 100.0]], atol=1e-9)
@@ -94,7 +94,7 @@ def test_fitness_is_the_share_of_the_source_within_the_threshold():
     np.testing.assert_allclose(refined.transform, np.eye(4), atol=1e-6)
 
 
-def test_what_the_planes_do_not_determine_keeps_its_initial_value():
+def test_directions_that_the_planes_do_not_constrain_keep_their_value():
     target, normals = room(4000, seed=1, walls=(2,))
     source = room(1000, seed=2, walls=(2,))[0] + [0.0, 0.0, 0.2]
     initial = motion(0, [0.1, -0.1, 0.0])
@@ -104,7 +104,7 @@ def test_what_the_planes_do_not_determine_keeps_its_initial_value():
     np.testing.assert_allclose(refined.transform, motion(0, [0.1, -0.1, -0.2]), atol=1e-9)
 
 
-def test_clouds_that_never_meet_are_answered_with_fitness_zero():
+def test_clouds_that_never_meet_get_fitness_zero():
     target, normals = room(100, seed=1)
 
     refined = refine_point_to_plane(target + 1000, target, normals, np.eye(4), 1.0)

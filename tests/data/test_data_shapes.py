@@ -46,7 +46,7 @@ def test_points_fall_on_triangles_by_area_and_evenly_within():
     large = points[:, 2] == 0
     assert large.mean() == pytest.approx(0.9, abs=0.01)
     np.testing.assert_allclose(points[large].mean(axis=0), [1, 1, 0], atol=0.02)
-    # The part of a triangle that is nearer to its corner than halfway is a quarter of it.
+    # A quarter of a triangle lies less than halfway from its corner to the opposite edge.
     assert (points[large, :2].sum(axis=1) < 1.5).mean() == pytest.approx(0.25, abs=0.01)
     np.testing.assert_array_equal(normals, np.broadcast_to([0.0, 0.0, 1.0], normals.shape))
 
@@ -62,7 +62,7 @@ def test_shares_of_names_are_uniform_and_differ_by_purpose():
     np.testing.assert_allclose(np.quantile(shares, [0.1, 0.5, 0.9]), [0.1, 0.5, 0.9], atol=0.04)
     others = [name_share(f"shape {i}", "order") for i in range(2000)]
     assert abs(np.corrcoef(shares, others)[0, 1]) < 0.1
-    # Stated once and for all: the splits of published corpora hang on it.
+    # These must never change, because the splits of published corpora depend on them.
     assert name_share("0ad:gaia/oak1", "split") == pytest.approx(0.16404, abs=1e-5)
 
 
@@ -89,7 +89,7 @@ def test_faces_without_area_or_with_broken_vertices_are_dropped():
         ),
     ],
 )  # fmt: skip
-def test_what_is_no_shape_is_told_why(mesh, reason):
+def test_a_mesh_that_is_not_fit_is_refused_with_the_reason(mesh, reason):
     with pytest.raises(Unfit, match=reason):
         shape_of(mesh)
 
@@ -102,7 +102,7 @@ def test_a_shape_with_a_far_outlier_is_left_out():
         np.vstack([knot.triangles, speck.triangles + len(knot.vertices)]),
         "far",
     )
-    # Enough of the surface lies far off that a sample meets it.
+    # Enough of the surface lies far away that a sample hits it.
     far.vertices[len(knot.vertices) :, 1:] *= 100
     with pytest.raises(Unfit, match="concentrated"):
         shape_of(far)
@@ -110,7 +110,7 @@ def test_a_shape_with_a_far_outlier_is_left_out():
 
 def test_the_spacing_is_what_two_samples_of_one_mesh_have():
     shape = make_shape(samples.knot(0), "a", 2000)
-    # Uniform points of density r on a surface: the nearest lies 1 / (2 sqrt r) away on average.
+    # For uniform points of density r on a surface, the mean nearest distance is 1 / (2 sqrt r).
     knot = clean_triangles(samples.knot(0))
     edges = np.cross(knot[:, 1] - knot[:, 0], knot[:, 2] - knot[:, 0])
     area = np.linalg.norm(edges, axis=1).sum() / 2
@@ -124,7 +124,7 @@ TURN = Rotation.from_euler("xyz", [50, -20, 130], degrees=True).as_matrix()
 
 
 @pytest.mark.parametrize("change", [np.eye(3), 7 * np.eye(3), MIRROR, TURN, MIRROR @ TURN])
-def test_a_shape_that_occurs_again_is_dropped_however_it_is_posed(change):
+def test_a_repeated_shape_is_dropped_in_any_pose(change):
     again = moved(samples.knot(0), change, (5, 0, 1))
     shapes = [shape_of(samples.knot(0)), shape_of(samples.knot(1)), shape_of(again, "again")]
     assert drop_duplicates(shapes, [True] * 3) == {2: 0}
@@ -157,7 +157,7 @@ def test_the_limit_is_wider_across_halves():
     assert drop_duplicates(shapes, [True, False]) == {1: 0}
 
 
-def test_shapes_of_their_own_all_stay():
+def test_distinct_shapes_all_stay():
     shapes = [shape_of(samples.knot(seed), str(seed)) for seed in range(12)]
     assert drop_duplicates(shapes, [True] * 12) == {}
     assert drop_duplicates([], []) == {}

@@ -26,10 +26,10 @@ ALL = Sampling(
     estimated_normals=0.6,
 )  # fmt: skip
 PLAIN = Sampling(points=48, neighbors=5, keep=(0.55, 0.85), scale=(0.8, 1.2))
-# of the 200 points of a shape a crop leaves fewer than a cloud has: some come twice
+# a crop leaves fewer of a shape's 200 points than a cloud has, so some come twice
 FEW = Sampling(points=90, neighbors=5, keep=(0.2, 0.4), noise=(0.0, 0.0), angle=0.0)
 HALF = Sampling(points=48, neighbors=5, keep=(0.5, 0.5), noise=(0.0, 0.0))
-# nearly all points in both clouds: how far apart they are is the noise
+# nearly all points are in both clouds, so their distances are the noise
 NOISY = Sampling(
     points=170, neighbors=5, keep=(0.95, 1.0), angle=0.0, noise=(0.005, 0.02), sensor_noise=0.4,
     sensor_scale=(0.02, 0.05),
@@ -40,7 +40,7 @@ CASES = {"plain": PLAIN, "few": FEW, "half": HALF, "noisy": NOISY, "uneven": UNE
 
 @pytest.fixture(scope="module")
 def corpus():
-    """Three bumpy ellipsoids, upright and off their middle, as float16 and int8 hold them."""
+    """Three bumpy ellipsoids, upright and off center, rounded to float16 and int8."""
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(3, 200, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -83,7 +83,7 @@ def on_host(corpus, sampling, count=PAIRS):
 
 
 def measured(pairs):
-    """What a pair is like, in numbers, each (pairs,)."""
+    """Statistics of pairs, each (pairs,)."""
     found = {"estimated": pairs["estimate_normals"].astype(float)}
     transforms = pairs["transform"].astype(np.float64)
     undone = Rotation.from_matrix(transforms[:, :3, :3].transpose(0, 2, 1))
@@ -114,12 +114,12 @@ def measured(pairs):
         found[f"{side} normals outward"] = np.median(outward, axis=1)
         found[f"{side} normals inward"] = np.min(outward, axis=1)
         found[f"{side} different"] = np.array([len(np.unique(one, axis=0)) for one in cloud])
-    # the host computes in float64: what is zero there is nearly so here
+    # the host computes in float64, so its zeros are only nearly zero on the device
     return {name: np.round(values, 5) for name, values in found.items()}
 
 
 def likelihoods(first, second):
-    """Of each number the Kolmogorov-Smirnov test's p that both have one distribution."""
+    """For each statistic, the Kolmogorov-Smirnov p-value for equal distributions."""
     return {name: ks_2samp(first[name], second[name]).pvalue for name in first}
 
 
@@ -130,15 +130,15 @@ def drawn(corpus):
 
 @pytest.fixture(scope="module")
 def numbers_of(corpus):
-    """What the device's pairs of a case are like."""
+    """The statistics of the device's pairs for a case."""
     return functools.cache(lambda case: measured(on_device(corpus, CASES[case])))
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_pairs_have_the_distribution_of_the_hosts(corpus, numbers_of, case):
+def test_pairs_have_the_distribution_of_pairs_from_the_host(corpus, numbers_of, case):
     found = likelihoods(numbers_of(case), measured(on_host(corpus, CASES[case])))
 
-    # about thirty tests, few of them independent: one in a thousand is rare enough
+    # about thirty tests, few of them independent, so one in a thousand is rare enough
     assert {name: p for name, p in found.items() if p < 1e-3} == {}
 
 
@@ -155,7 +155,7 @@ def test_pairs_have_the_distribution_of_the_hosts(corpus, numbers_of, case):
     ],
     ids=str,
 )  # fmt: skip
-def test_the_same_tests_see_a_field_that_differs(corpus, numbers_of, case, change):
+def test_the_statistics_detect_a_field_that_differs(corpus, numbers_of, case, change):
     """Without this, the tests above might accept anything."""
     other = Sampling(**{**CASES[case].__dict__, **change})
 
@@ -164,7 +164,7 @@ def test_the_same_tests_see_a_field_that_differs(corpus, numbers_of, case, chang
     assert min(found.values()) < 1e-4
 
 
-def test_the_truth_lays_one_cloud_on_the_other(corpus):
+def test_the_truth_maps_one_cloud_onto_the_other(corpus):
     whole = Sampling(
         points=199, neighbors=6, keep=(1.0, 1.0), noise=(0.0, 0.0), both_ways=0.5, near=0.5,
         centered=0.5, any_orientation=0.5, scale=(0.5, 2.0),
@@ -183,18 +183,18 @@ def test_the_truth_lays_one_cloud_on_the_other(corpus):
         np.testing.assert_allclose(lengths, 1, atol=1e-5)
 
 
-def test_neighbors_are_those_of_the_clouds_as_they_come(drawn):
+def test_neighbors_are_those_of_the_final_clouds(drawn):
     for side in ("source", "target"):
         for cloud, found in zip(drawn[side][:10], drawn[f"{side}_neighbors"], strict=False):
             wanted = nearest_on_host(cloud, ALL.neighbors, radius=ALL.radius)
             np.testing.assert_array_equal(np.sort(found), np.sort(wanted))
 
 
-def test_a_pair_is_a_function_of_its_place_in_the_stream_alone(corpus, drawn):
+def test_a_pair_depends_only_on_its_position_in_the_stream(corpus, drawn):
     later = on_device(corpus, ALL, count=5, first=7)
 
     for key, leaf in later.items():
-        if leaf.dtype == np.float32:  # a batch of another size is rounded otherwise
+        if leaf.dtype == np.float32:  # a batch of another size rounds differently
             np.testing.assert_allclose(leaf, drawn[key][7:12], atol=1e-6)
         elif leaf.dtype == bool:
             np.testing.assert_array_equal(leaf, drawn[key][7:12])
@@ -202,7 +202,7 @@ def test_a_pair_is_a_function_of_its_place_in_the_stream_alone(corpus, drawn):
     assert (other["source"] != later["source"]).any(axis=(1, 2)).all()
 
 
-def test_a_corpus_loses_little_in_nine_bytes_a_point(corpus):
+def test_a_corpus_loses_little_in_nine_bytes_per_point(corpus):
     shapes = Shapes.of(corpus)
 
     np.testing.assert_array_equal(shapes.points.astype(np.float32), corpus.points)
@@ -237,6 +237,6 @@ def test_the_drawing_lowers_for_accelerators(corpus, platform):
 
     called = set(re.findall(r"custom_call @([\w.$]+)", text))
     assert not {name for name in called if re.search("lapack|callback|cpu", name)}
-    # positions and motions at full precision: every product says so
+    # every product asks for full precision, which positions and motions need
     products = [line for line in text.splitlines() if "stablehlo.dot_general" in line]
     assert products and all(line.count("HIGHEST") == 2 for line in products)

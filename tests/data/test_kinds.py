@@ -1,4 +1,4 @@
-"""The table of kinds of data: everyone looks there, and a kind from outside is one of them."""
+"""The table of kinds of data: all code uses it, and a kind from outside can be added."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ NAMES = [kind.name for kind in kinds.known()]
 
 
 def scans_of(folder: Path) -> list[tuple[str, np.ndarray]]:
-    """Scans of a survey: a file, and where it was taken, a line each."""
+    """Scans of a survey, with one line per scan: its file, and where it was taken."""
     rows = [line.split() for line in (folder / "survey.log").read_text().splitlines()]
     return [(name, np.array([float(x) for x in place])) for name, *place in rows]
 
 
 def pairs_of(folder: Path, step: int) -> list[Pair]:
-    """Each scan with the one `step` places later, and the motion between them."""
+    """Pairs of a scan and the one `step` places later, with the motion between them."""
     made = []
     scans = scans_of(folder)
     for (name, place), (other, there) in zip(scans, scans[step:], strict=False):
@@ -80,8 +80,10 @@ SURVEY = DataKind(
 
 @pytest.fixture
 def survey(monkeypatch, tmp_path):
-    """The table with one kind more, for one test, and a folder of that kind: four scans of one
-    place. Its files alone look like a folder of clouds."""
+    """A folder with four scans of one place, of a kind that is in the table for one test only.
+
+    Without that kind, its files look like a folder of clouds.
+    """
     monkeypatch.setattr(kinds, "_KINDS", list(kinds.known()))
     kinds.add_kind(SURVEY)
     folder = tmp_path / "survey"
@@ -130,7 +132,8 @@ def test_a_training_draws_from_a_kind_from_outside(survey, tmp_path, named):
     moved = pieces.move(pair["transform"].astype(np.float64), pair["source"])
     gap = np.linalg.norm(moved[:, None] - pair["target"], axis=-1).min(axis=1)
     assert np.quantile(gap, 0.95) < 1e-4
-    with pytest.raises(ValueError, match="data.train.here: survey got .*steps.*perhaps step"):
+    wanted = "data.train.here: survey got .*steps.*wanted path and, optionally, step"
+    with pytest.raises(ValueError, match=wanted):
         open_mixture({"here": {"kind": named, "path": survey, "steps": 2}}, tmp_path, "data.train")
 
 
@@ -138,7 +141,7 @@ def test_train_py_takes_a_kind_from_outside_by_its_config(survey, tmp_path):
     config = training_config(survey)
     about = {"kind": "survey", "path": str(survey)}
     config.data.train, config.data.validation = {"here": about}, {"here": about | {"step": 3}}
-    with pytest.raises(ValueError, match="2 of its 2 scans are in data.train, too"):
+    with pytest.raises(ValueError, match="2 of its 2 scans are also in data.train"):
         prepare(config, tmp_path)
 
 
@@ -156,7 +159,7 @@ def test_an_evaluation_measures_on_a_kind_from_outside(survey, tmp_path, named):
         read_pairs(data, 2, tmp_path)
 
 
-def test_a_name_is_given_once():
+def test_a_name_can_be_used_only_once():
     for name in ("kitti", "auto"):
         with pytest.raises(ValueError, match=f"name: '{name}' is taken"):
             kinds.add_kind(DataKind(name=name, words="", recognize=lambda _: None))
@@ -166,14 +169,14 @@ def test_a_name_is_given_once():
 @pytest.mark.parametrize(
     ("old", "new"), [("shapes", "corpus"), ("pairs", "pair-list"), ("scans", "clouds")]
 )
-def test_a_word_of_old_configs_is_answered_with_the_new_one(old, new, tmp_path):
+def test_a_name_from_old_configs_is_answered_with_the_new_one(old, new, tmp_path):
     with pytest.raises(ValueError, match=f"data.train.a.kind: '{old}' has a new name: {new}"):
         open_mixture({"a": {"kind": old, "path": "a"}}, tmp_path, "data.train")
     with pytest.raises(ValueError, match=f"data.kind: '{old}' has a new name: {new}"):
         read_pairs({"kind": old, "path": "a"}, 0, tmp_path)
 
 
-def test_what_cannot_be_trained_on_is_told_by_name_and_by_layout(tmp_path):
+def test_data_that_cannot_be_trained_on_is_refused_by_name_and_by_layout(tmp_path):
     with pytest.raises(ValueError, match="kind: got 'meshes', wanted one of pair-list, pair-file"):
         open_mixture({"a": {"kind": "meshes", "path": "a"}}, tmp_path, "data.train")
     (tmp_path / "a.stl").touch()
@@ -191,7 +194,7 @@ def test_the_example_of_a_kind_has_all_its_settings(kind):
         assert [name for name in needed if name not in data] == []
 
 
-def test_shapes_and_scans_are_not_validated_on_in_one_batch(survey, tmp_path):
+def test_shapes_and_scans_cannot_share_a_validation_batch(survey, tmp_path):
     with h5py.File(tmp_path / "shapes.h5", "w") as file:
         file["data"] = np.random.default_rng(0).normal(size=(2, 2048, 3)).astype(np.float32)
         file["normal"] = np.ones((2, 2048, 3), np.float32)

@@ -106,7 +106,7 @@ def test_a_method_that_crashes_hangs_or_raises_fails_on_that_pair_alone(tmp_path
     assert "SIGSEGV" in reasons[1]
     assert "no answer within 1 s" in reasons[2]
     assert reasons[3] == "RuntimeError: no luck"
-    assert reasons[4] == "answered no rigid motion"
+    assert reasons[4] == "returned a motion that is not rigid"
 
 
 def test_a_method_whose_library_is_missing_is_left_out_with_the_way_out(tmp_path):
@@ -152,7 +152,7 @@ def test_stored_answers_keep_every_digit(tmp_path):
 def test_a_damaged_file_of_answers_is_refused(tmp_path, content):
     path = tmp_path / "part.json"
     path.write_text(content)
-    with pytest.raises(ValueError, match="no file of results .*remove it"):
+    with pytest.raises(ValueError, match="not a file of results .*remove it"):
         store.load(path, dict(ABOUT), [])
 
 
@@ -229,7 +229,7 @@ def test_the_table_is_the_same_but_for_the_section_on_time():
     assert "recall 5°, 2 m" in before[0]
     assert "**icp**: not run, open3d is needed" in before[0]
     assert "**identity**, 1 pairs (2): no luck" in before[0]
-    assert "3 of the pairs are of shapes" in before[0]
+    assert "3 of the pairs show shapes" in before[0]
     assert before[0].count("| identity | 30.00 | 30.00 | 0.5000 |") == 2
 
 
@@ -259,7 +259,7 @@ def test_pairs_of_a_corpus_are_those_of_its_fixed_protocol(tmp_path, kind):
         ({"kind": "movies"}, 1, "data.kind: got 'movies', wanted one of pair-list, pair-file"),
         ({"protocol": "hard"}, 1, "protocol: got 'hard', wanted one of clean, noise, partial"),
         ({"path": "nowhere.h5"}, 1, "no corpus at nowhere.h5"),
-        ({"kind": "modelnet40", "path": "nowhere", "split": "test"}, 1, "Get modelnet40_ply"),
+        ({"kind": "modelnet40", "path": "nowhere", "split": "test"}, 1, "Download modelnet40_ply"),
         ({}, -1, "limit is -1"),
     ],
 )

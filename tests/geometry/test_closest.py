@@ -1,4 +1,4 @@
-"""The closest point is that of a search through all, on CPUs and on accelerators."""
+"""The closest point is the one that an exhaustive search finds, on CPUs and on accelerators."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ def clouds(n=1100, m=1000):
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("search", SEARCHES)
-def test_the_closest_point_is_that_of_a_tree(search, masked):
+def test_the_closest_point_is_the_one_a_tree_finds(search, masked):
     queries, points, mask = clouds()
     mask = mask if masked else np.ones_like(mask)
 
@@ -35,7 +35,7 @@ def test_the_closest_point_is_that_of_a_tree(search, masked):
 
 
 @pytest.mark.parametrize("search", SEARCHES)
-def test_of_equally_close_points_the_first_is_taken(search):
+def test_among_equally_close_points_the_first_is_chosen(search):
     queries, points, _ = clouds(20, 10)
 
     found = SEARCHES[search](jnp.asarray(queries), jnp.asarray(np.tile(points, (3, 1))), None)
@@ -44,7 +44,7 @@ def test_of_equally_close_points_the_first_is_taken(search):
 
 
 @pytest.mark.parametrize("search", SEARCHES)
-def test_where_no_point_is_valid_some_point_is_named(search):
+def test_if_no_point_is_valid_some_index_is_still_returned(search):
     queries, points, mask = clouds(20, 10)
 
     found = SEARCHES[search](*map(jnp.asarray, (queries, points, np.zeros_like(mask))))
@@ -52,7 +52,7 @@ def test_where_no_point_is_valid_some_point_is_named(search):
     assert ((found >= 0) & (found < 10)).all()
 
 
-def test_the_distance_comes_with_it_and_with_its_gradient():
+def test_the_distance_is_right_and_so_is_its_gradient():
     queries, points, _ = (jnp.asarray(part) for part in clouds())
 
     found = jax.jit(closest)(queries, points)

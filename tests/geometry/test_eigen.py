@@ -1,4 +1,4 @@
-"""Eigenvectors against LAPACK, and the derivative of the least direction."""
+"""Eigenvectors compared with LAPACK's, and the derivative of the least direction."""
 
 import functools
 
@@ -65,7 +65,7 @@ def random_symmetric(size, count=500):
 
 
 @pytest.mark.parametrize("size", [3, 4])
-def test_the_last_sweep_no_longer_changes_a_float32_result_and_the_first_do(size):
+def test_the_last_sweep_changes_no_float32_result_and_the_first_ones_do(size):
     matrices = random_symmetric(size)
 
     values, earlier, early = (
@@ -78,7 +78,7 @@ def test_the_last_sweep_no_longer_changes_a_float32_result_and_the_first_do(size
 
 
 def shares(matrices, **options):
-    """What the leading eigenvectors found have of each eigenvector of float64, ascending."""
+    """Components of the leading eigenvectors along each float64 eigenvector, ascending."""
     leading = jax.vmap(functools.partial(leading_eigenvector, **options))
     found = np.asarray(jax.jit(leading)(jnp.asarray(matrices, jnp.float32)), np.float64)
     vectors = np.linalg.eigh(np.asarray(matrices, np.float64))[1]
@@ -105,7 +105,7 @@ def test_the_leading_eigenvector_lies_among_those_of_the_largest_eigenvalue(valu
     np.testing.assert_allclose(others, 0, atol=1e-4 if 0.99 in values else 2e-6)
 
 
-def test_the_leading_eigenvector_of_nothing_is_the_first_axis():
+def test_the_leading_eigenvector_of_zero_is_the_first_axis():
     np.testing.assert_array_equal(leading_eigenvector(jnp.zeros((4, 4))), [1, 0, 0, 0])
 
 
@@ -117,7 +117,7 @@ def test_squarings_tell_apart_eigenvalues_that_differ_by_a_hundred_thousandth():
     assert lost(shares(matrices, squarings=SQUARINGS // 2)) > 0.2
 
 
-def test_the_least_direction_is_that_of_lapack():
+def test_the_least_direction_is_the_one_from_lapack():
     rng = np.random.default_rng(2)
     factors = rng.normal(size=(100, 5, 3)).astype(np.float32)
     covariances = factors.transpose(0, 2, 1) @ factors
@@ -129,7 +129,7 @@ def test_the_least_direction_is_that_of_lapack():
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_the_least_direction_has_its_finite_differences_as_derivative(x64, scale):
+def test_the_derivative_of_the_least_direction_matches_finite_differences(x64, scale):
     rng = np.random.default_rng(3)
     factor = rng.normal(size=(5, 3))
     covariance = jnp.asarray(factor.T @ factor) * scale

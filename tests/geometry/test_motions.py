@@ -1,4 +1,4 @@
-"""Motions in numpy: against scipy, and by what they must satisfy."""
+"""Motions in numpy: compared with scipy, and checked by their invariants."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_the_inverse_undoes_a_motion_in_its_own_precision():
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-9, 1e-3, 1.0, 90.0, 179.0])
-def test_the_angle_is_that_of_the_rotation_between(degrees):
+def test_the_angle_is_that_of_the_rotation_between_two_motions(degrees):
     first = random_motions(1)[0]
     second = first @ turned(degrees)
 
@@ -62,8 +62,8 @@ def test_the_angle_reaches_half_a_turn_and_takes_several_motions():
     np.testing.assert_allclose(found, [0, 180], atol=1e-5)
 
 
-def test_the_nearest_rotation_is_that_of_scipys_fit():
-    matrices = np.random.default_rng(0).normal(size=(200, 3, 3))  # half of them mirror
+def test_the_nearest_rotation_matches_scipys_fit():
+    matrices = np.random.default_rng(0).normal(size=(200, 3, 3))  # half of them are reflections
 
     found = motions.nearest_rotation(matrices)
 
@@ -92,20 +92,20 @@ def broken(**changes):
 
 BROKEN = {
     "not all numbers are finite": broken(at={(0, 3): np.nan}),
-    "off the identity": np.diag([1.0, 1.0, 1.01, 1.0]),
+    "differs from the identity": np.diag([1.0, 1.0, 1.01, 1.0]),
     "R is a reflection": np.diag([1.0, 1.0, -1.0, 1.0]),
     "last row is": broken(at={(3, 3): 2.0}),
 }
 
 
 @pytest.mark.parametrize("why", BROKEN)
-def test_what_is_no_motion_is_refused_with_its_name_and_the_reason(why):
+def test_a_matrix_that_is_not_rigid_is_refused_with_name_and_reason(why):
     with pytest.raises(ValueError, match=f"^given: got .*not rigid .*{why}.*wanted a proper"):
         motions.check_rigid("given", BROKEN[why])
     assert not motions.are_rigid(BROKEN[why])
 
 
-def test_of_several_motions_the_first_bad_one_is_named():
+def test_among_several_motions_the_first_bad_one_is_named():
     several = random_motions(4)
     several[2:] = BROKEN["R is a reflection"]
 
@@ -117,14 +117,14 @@ def test_of_several_motions_the_first_bad_one_is_named():
 
 
 @pytest.mark.parametrize(("scale", "rigid"), [(1 + 4e-4, True), (1 + 6e-4, False)])
-def test_the_tolerance_is_of_the_product_with_the_transpose(scale, rigid):
+def test_the_tolerance_applies_to_the_product_with_the_transpose(scale, rigid):
     transform = random_motions(1)[0]
-    transform[:3, :3] *= scale  # R R' is off by 2 * (scale - 1)
+    transform[:3, :3] *= scale  # R R' differs from I by 2 * (scale - 1)
 
     assert motions.are_rigid(transform) == rigid
 
 
-def test_quaternions_are_scipys_there_and_back():
+def test_quaternions_match_scipy_in_both_directions():
     quaternions = np.random.default_rng(0).normal(size=(100, 4))
 
     found = motions.from_quaternion(quaternions)
@@ -137,7 +137,7 @@ def test_quaternions_are_scipys_there_and_back():
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 2.0, np.pi - 1e-9, np.pi])
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 3)])
-def test_quaternions_hold_up_to_half_a_turn(axis, angle):
+def test_quaternions_are_accurate_up_to_half_a_turn(axis, angle):
     rotation = Rotation.from_rotvec(np.array(axis) / np.linalg.norm(axis) * angle)
 
     found = Rotation.from_quat(motions.to_quaternion(rotation.as_matrix()))
@@ -146,7 +146,7 @@ def test_quaternions_hold_up_to_half_a_turn(axis, angle):
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-9, 9.9e-4, 1.1e-3, 1.0, 3.1])
-def test_rotation_vectors_are_scipys_there_and_back(length):
+def test_rotation_vectors_match_scipy_in_both_directions(length):
     turn = length * np.array([2.0, -1.0, 2.0]) / 3
 
     found = motions.from_rotvec(turn)

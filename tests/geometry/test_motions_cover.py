@@ -1,4 +1,4 @@
-"""The cover of SO(3): proper rotations, and none far from all of them."""
+"""The cover of SO(3): proper rotations, and no rotation is far from all of them."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_all_are_proper_rotations_and_always_the_same(count):
     assert np.array_equal(rotations, cover(count))
 
 
-def test_no_two_of_them_are_close():
+def test_no_two_rotations_are_close():
     quaternions = Rotation.from_matrix(cover(128)).as_quat()
 
     cosine = np.abs(quaternions @ quaternions.T) - 2 * np.eye(128)
@@ -44,6 +44,6 @@ def test_no_two_of_them_are_close():
     assert np.degrees(2 * np.arccos(cosine.max())) > 30
 
 
-def test_a_cover_of_none_is_refused():
+def test_a_cover_of_zero_rotations_is_refused():
     with pytest.raises(ValueError, match="^count: got 0"):
         cover(0)

@@ -1,4 +1,4 @@
-"""All searches give the sets of the plain one, ties and duplicates included."""
+"""All searches find the same sets as the plain one, including ties and duplicates."""
 
 import functools
 
@@ -11,7 +11,7 @@ from oracle import cfr, pieces
 from cfr_jax.geometry import neighbors
 from cfr_jax.geometry.neighbors import first_in_ball, nearest, nearest_on_host
 
-# how CPUs search, and how accelerators do: sorting all, sorting groups, several blocks of those
+# the search on CPUs, and those on accelerators: sorting all, sorting groups, in several blocks
 SIZES = {"all": {"few": 200}, "groups": {"few": 8}, "blocks": {"few": 8, "entries": 5000}}
 
 
@@ -89,7 +89,7 @@ def one_alone(name):
     points = CLOUDS[name](np.random.default_rng(1)).astype(np.float32)
     points[7] += 4
     wanted = sets(cfr.find_neighbors(points, 20, 0.3))
-    # its nearest stays, and other points lose some of theirs
+    # it keeps its nearest neighbor, and other points lose some of theirs
     assert len(set(wanted[7])) == 1 and (wanted != sets(pieces.nearest_neighbors(points, 20))).any()
     return points, wanted
 
@@ -116,7 +116,7 @@ def test_blocks_of_rows_join_without_a_seam(on_device):
     )
 
 
-def test_masked_points_are_nobodys_neighbor(on_device):
+def test_masked_points_are_never_neighbors(on_device):
     rng = np.random.default_rng(3)
     points = rng.normal(size=(125, 3)).astype(np.float32)
     mask = rng.random(125) < 0.6
@@ -141,7 +141,7 @@ def test_too_few_valid_points_repeat_their_nearest(on_device):
         assert (np.sort(found[row]) == np.sort([*others, *[first[row]] * 9])).all()
 
 
-def test_half_a_batch_is_searched_like_the_whole():
+def test_a_batch_is_searched_like_single_clouds():
     clouds = np.random.default_rng(5).normal(size=(2, 125, 3)).astype(np.float32)
 
     together = jax.jit(jax.vmap(lambda cloud: nearest(cloud, 12)))(jnp.asarray(clouds))
@@ -167,7 +167,7 @@ def test_balls_hold_their_first_points_by_index(name, k, search):
     rng = np.random.default_rng(7)
     points, mask = CLOUDS[name](rng).astype(np.float32), rng.random(125) < 0.7
     distance = np.linalg.norm(points[:, None] - points[None], axis=2)
-    radius = float(np.median(distance)) / 2 + 1e-3  # on no distance of the lattice
+    radius = float(np.median(distance)) / 2 + 1e-3  # not equal to a distance in the lattice
 
     found = IN_BALL[search](jnp.asarray(points), jnp.asarray(mask), k, radius)
 

@@ -1,4 +1,4 @@
-"""Estimated normals: those of known surfaces, turned outward, moving with the cloud."""
+"""Estimated normals: those of known surfaces, pointing outward, and moving with the cloud."""
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +50,7 @@ def test_normals_move_with_the_cloud():
     np.testing.assert_allclose(normals_of(moved), normals_of(points) @ turn.T, atol=1e-4)
 
 
-def test_padding_changes_no_normal_and_has_none():
+def test_padding_changes_no_normal_and_has_zero_normals():
     points = ball(3, 100)
     neighbors = nearest_on_host(points, 12)
     padded = np.concatenate([points, np.full((20, 3), 77, np.float32)])
@@ -92,7 +92,7 @@ def test_normals_are_unit_with_finite_gradients_for_any_cloud(name):
     assert np.isfinite(gradient(jnp.asarray(points), neighbors, pull)).all()
 
 
-def test_gradients_are_their_finite_differences(x64):
+def test_gradients_match_finite_differences(x64):
     rng = np.random.default_rng(5)
     points, change, pull = (jnp.asarray(a) for a in rng.normal(size=(3, 20, 3)))
     neighbors = jnp.asarray(pieces.nearest_neighbors(np.asarray(points), 6).astype(np.int32))

@@ -1,4 +1,4 @@
-"""Rigid motions against numpy's SVD and scipy, and finite derivatives where an SVD has none."""
+"""Rigid motions compared with numpy's SVD and scipy, and derivatives where an SVD has none."""
 
 import functools
 
@@ -49,7 +49,7 @@ def assert_proper(rotations, atol=5e-6):
 @pytest.mark.parametrize(
     "values", [(3.0, 2.0, 1.0), (3.0, 2.0, -1.0), (1.0, 1.0, 1.0), (1.0, 0.5, 0.0), (1.0, 1.0, 0.0)]
 )
-def test_the_nearest_rotation_is_that_of_an_svd(values, scale):
+def test_the_nearest_rotation_matches_an_svd(values, scale):
     # reflections (a negative last value), planar clouds (a zero one), repeated values
     matrices = with_singular_values(np.random.default_rng(0), values) * scale
 
@@ -60,7 +60,7 @@ def test_the_nearest_rotation_is_that_of_an_svd(values, scale):
 
 @pytest.mark.parametrize("values", [(1.0, 0.0, 0.0), (1.0, 1.0, -1.0), (1.0, 0.5, -0.5), (0, 0, 0)])
 @pytest.mark.parametrize("scale", [1e-20, 1.0, 1e20])
-def test_where_the_nearest_rotation_is_not_unique_one_of_them_is_given(values, scale):
+def test_if_the_nearest_rotation_is_not_unique_one_of_them_is_returned(values, scale):
     matrices = with_singular_values(np.random.default_rng(1), values) * scale
 
     found = np.asarray(nearest(jnp.asarray(matrices, jnp.float32)), np.float64)
@@ -70,13 +70,13 @@ def test_where_the_nearest_rotation_is_not_unique_one_of_them_is_given(values, s
     np.testing.assert_allclose(reached, scale * np.sum(values), atol=5e-6 * scale)
 
 
-def test_the_nearest_rotation_of_nothing_is_the_identity():
+def test_the_nearest_rotation_of_zero_is_the_identity():
     np.testing.assert_array_equal(rigid.nearest_rotation(jnp.zeros((3, 3))), np.eye(3))
 
 
 @pytest.mark.parametrize("values", [(3.0, 2.0, 1.0), (3.0, 2.0, -1.0), (1.0, 1.0, 1.0)])
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_the_nearest_rotation_has_its_finite_differences_as_derivative(x64, values, scale):
+def test_the_derivative_of_the_nearest_rotation_matches_finite_differences(x64, values, scale):
     rng = np.random.default_rng(2)
     matrix = jnp.asarray(with_singular_values(rng, values, 1)[0]) * scale
     change = jnp.asarray(rng.normal(size=(3, 3))) * scale
@@ -109,7 +109,7 @@ def test_fitting_recovers_a_motion(scale):
     transform = random_motions(rng, 1)[0]
     target = pieces.move(transform, source)
     weights = rng.uniform(0.5, 1, 40)
-    target[:5], weights[:5] = 99, 0  # without weight, without influence
+    target[:5], weights[:5] = 99, 0  # points without weight have no influence
 
     found = rigid.fit_rigid(
         *(jnp.asarray(part, jnp.float32) for part in (source * scale, target * scale, weights))
@@ -119,7 +119,7 @@ def test_fitting_recovers_a_motion(scale):
     np.testing.assert_allclose(found[:3, 3], transform[:3, 3] * scale, atol=5e-6 * scale)
 
 
-def test_a_fit_to_scattered_points_is_the_references():
+def test_a_fit_to_scattered_points_matches_the_reference():
     rng = np.random.default_rng(5)
     source, target = rng.normal(size=(2, 30, 3))
     for weights in (rng.uniform(0, 1, 30), rng.uniform(0, 1e-5, 30)):
@@ -162,7 +162,7 @@ def test_a_fit_is_proper_with_finite_gradients_for_any_cloud(name, weight):
     assert all(np.isfinite(gradient).all() for gradient in gradients)
 
 
-def test_a_fit_has_its_finite_differences_as_derivative(x64):
+def test_the_derivative_of_a_fit_matches_finite_differences(x64):
     rng = np.random.default_rng(9)
     at = tuple(jnp.asarray(part) for part in (*rng.normal(size=(2, 9, 3)), rng.uniform(size=9)))
     towards = tuple(jnp.asarray(rng.normal(size=part.shape)) for part in at)
@@ -188,7 +188,7 @@ ANGLES = [0.0, 1e-8, 1e-4, 0.009, 0.011, 0.5, 2.0, 3.0, np.pi - 1e-3, np.pi - 1e
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_exp_is_the_matrix_exponential_and_log_takes_it_back(angle):
+def test_exp_is_the_matrix_exponential_and_log_inverts_it(angle):
     given = twists(angle)
     generators = np.zeros((len(given), 4, 4))
     for row, (x, y, z) in enumerate(given[:, :3]):
@@ -200,7 +200,7 @@ def test_exp_is_the_matrix_exponential_and_log_takes_it_back(angle):
     back = log(found)
 
     np.testing.assert_allclose(found, wanted, atol=2e-6)
-    # near a half turn the axis is known no better than its sign
+    # near a half turn, the sign of the axis is not determined
     np.testing.assert_allclose(exp(back), wanted, atol=1e-5)
     if angle < 3.1:
         np.testing.assert_allclose(back, given, atol=2e-5)
@@ -216,7 +216,7 @@ def test_exp_and_log_have_finite_gradients(angle):
     assert np.isfinite(there).all() and np.isfinite(back).all()
 
 
-def test_moving_composing_and_inverting_fit_together():
+def test_moving_composing_and_inverting_agree():
     rng = np.random.default_rng(11)
     first, second = (jnp.asarray(t, jnp.float32) for t in random_motions(rng, 2))
     points = jnp.asarray(rng.normal(size=(7, 3)), jnp.float32)
@@ -233,7 +233,7 @@ def test_moving_composing_and_inverting_fit_together():
     )
 
 
-def test_quaternions_go_there_and_back():
+def test_quaternions_convert_in_both_directions():
     rotations = Rotation.random(300, random_state=12)
     half_turns = Rotation.from_rotvec(np.pi * np.eye(3))
     for given in (rotations, half_turns):
@@ -261,7 +261,7 @@ def test_the_rotation_error_is_the_angle_down_to_thousandths(degrees):
     np.testing.assert_allclose(error, degrees, rtol=1e-4, atol=0.03 if degrees == 180 else 2e-5)
 
 
-def test_errors_have_finite_gradients_at_no_error():
+def test_errors_have_finite_gradients_at_zero_error():
     truth = jnp.asarray(random_motions(np.random.default_rng(14), 1)[0], jnp.float32)
 
     for error in (rigid.rotation_error, rigid.translation_error):
@@ -269,7 +269,7 @@ def test_errors_have_finite_gradients_at_no_error():
         assert np.isfinite(jax.grad(error)(truth, truth)).all(), error.__name__
 
 
-def test_the_translation_error_is_that_of_the_motion_left():
+def test_the_translation_error_is_that_of_the_remaining_motion():
     found, truth = random_motions(np.random.default_rng(15), 2)
 
     error = rigid.translation_error(*(jnp.asarray(t, jnp.float32) for t in (found, truth)))

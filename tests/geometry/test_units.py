@@ -19,12 +19,12 @@ def unit(cloud, frames, center, *, budget=2000, seed=0):
 
 
 def widest_gap(points, rows):
-    """Furthest that any point lies from a chosen one."""
+    """The largest distance of any point from its nearest chosen point."""
     return cKDTree(points[rows]).query(points)[0].max()
 
 
 def uneven_square(count, seed):
-    """Nine tenths of the points lie in a hundredth of the area."""
+    """A cloud with nine tenths of its points in a hundredth of its area."""
     rng = np.random.default_rng(seed)
     size = np.where(rng.random(count) < 0.9, 0.2, 2.0)[:, None]
     return rng.uniform(-0.5, 0.5, (count, 3)) * size * [1, 1, 0]
@@ -36,7 +36,7 @@ def test_a_cloud_within_budget_is_kept_whole():
     assert subsample(points, 50, 0).tolist() == list(range(50))
 
 
-def test_thinning_is_within_budget_and_decided_by_the_seed():
+def test_thinning_is_within_budget_and_determined_by_the_seed():
     points = solids.lopsided(3000, 0).points
 
     first, again, other = (subsample(points, 400, seed) for seed in (0, 0, 1))
@@ -142,7 +142,7 @@ def test_unit_clouds_are_centered_and_as_large_as_the_unit_sphere(offset):
     assert found.mask.sum() == 800 == len(found.rows)
 
 
-def test_padding_is_zero_and_nobodys_neighbor():
+def test_padding_is_zero_and_never_a_neighbor():
     cloud = PointCloud(*solids.lopsided(130, 0))
     frames = unit_frames(cloud, cloud, None)
 
@@ -165,7 +165,7 @@ def test_an_initial_motion_is_kept_where_the_network_changes_nothing(dtype, offs
     frames = unit_frames(source, target, initial)
     found = frames.to_caller(np.eye(4))
 
-    # a rounded rotation is no rotation: what is off turns about the cloud, not about the origin
+    # a rounded rotation is not exact; its error turns the cloud about itself, not about the origin
     assert np.abs(found[:3, :3] @ found[:3, :3].T - np.eye(3)).max() < 1e-12
     assert np.abs(solids.move(found, source.points) - target.points).max() < 1e-6
     assert np.array_equal(frames.source_center, frames.target_center)

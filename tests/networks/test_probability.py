@@ -64,7 +64,7 @@ GOOD = {"register": {"bias": 1.0}, "align": {"bias": 2.0}}
 @pytest.mark.parametrize(
     ("note", "told"),
     [
-        ("{", "the note is no JSON"),
+        ("{", "the note is not valid JSON"),
         ("[]", "got list, wanted register and align"),
         ('{"register": {"bias": 1}}', r"got \['register'\], wanted register and align"),
         (json.dumps(GOOD | {"align": {"fitness": 1.0}}), "align has no bias"),
@@ -81,7 +81,8 @@ def test_a_damaged_note_is_refused(note, told):
 
 def test_coefficients_of_other_clues_are_refused():
     FITTED.check("register", ["settled"])
-    with pytest.raises(ValueError, match=r"align has other clues than .*\(fitness, speed\).*anew"):
+    wanted = r"align has other clues than .*\(fitness, speed\).*fit it again"
+    with pytest.raises(ValueError, match=wanted):
         FITTED.check("align", ["speed"])
 
 

@@ -1,4 +1,4 @@
-"""Types of the fields of a dataclass, checked by value."""
+"""The types of a dataclass's fields are checked against their values."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,7 +26,7 @@ class Sample:
     anything: object = None
 
 
-def test_values_of_their_types_pass():
+def test_values_of_the_right_type_pass():
     check_types(Sample())
     check_types(Sample(rate=1, threads=2, anything=[3]))
 
@@ -46,6 +46,6 @@ def test_values_of_their_types_pass():
         ("inner", {}, "s.inner: got {}, wanted Inner"),
     ],
 )
-def test_a_value_of_another_type_is_named(name, value, wanted):
+def test_a_value_of_the_wrong_type_is_named(name, value, wanted):
     with pytest.raises(ValueError, match=f"^{wanted}$"):
         check_types(Sample(**{name: value}), "s.")

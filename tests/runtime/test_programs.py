@@ -1,4 +1,4 @@
-"""Lowered programs that are kept between processes: the same answers, and nothing that is stale."""
+"""Lowered programs that are kept between processes give the same results and are never stale."""
 
 import os
 
@@ -15,7 +15,7 @@ from cfr_jax.runtime import programs
 
 @struct.dataclass
 class Answer:
-    """What the program under test answers."""
+    """The result of the program under test."""
 
     total: jax.Array
     each: dict
@@ -37,7 +37,7 @@ NUMBERS, WEIGHTS = jnp.arange(4.0), {"scale": jnp.float32(3)}
 
 
 def call(function=program):
-    """As a process of its own would: nothing is remembered but what lies in the folder."""
+    """Runs it as a new process would: only what is in the folder is remembered."""
     programs._program.cache_clear()
     function.clear_cache()
     TRACED.clear()
@@ -70,7 +70,7 @@ def test_a_kept_program_is_not_traced_again(folder):
 
 @pytest.mark.parametrize("left", [0, 1, 32, 100, -1])
 @pytest.mark.parametrize("flipped", [False, True], ids=["cut off", "one bit flipped"])
-def test_a_damaged_one_is_made_again(folder, left, flipped):
+def test_a_damaged_program_is_made_again(folder, left, flipped):
     call()
     (path,) = folder.rglob("*.stablehlo")
     content = bytearray(path.read_bytes())
@@ -85,7 +85,7 @@ def test_a_damaged_one_is_made_again(folder, left, flipped):
     assert TRACED
 
 
-def test_other_versions_keep_their_own(folder, monkeypatch):
+def test_each_version_keeps_its_own_programs(folder, monkeypatch):
     call()
     monkeypatch.setattr(jax, "__version__", "other")
     programs.keep_in(folder)
@@ -96,7 +96,7 @@ def test_other_versions_keep_their_own(folder, monkeypatch):
     assert len(list(folder.rglob("*.stablehlo"))) == 2
 
 
-def test_what_was_not_used_for_a_month_goes_and_nothing_else(folder, monkeypatch):
+def test_only_programs_unused_for_a_month_are_deleted(folder, monkeypatch):
     call()
     (old,) = folder.rglob("*.stablehlo")
     mine = folder / "programs-mine" / "thesis.stablehlo"
@@ -122,7 +122,7 @@ def test_functions_that_share_a_name_are_not_mixed_up(folder):
 
 @struct.dataclass
 class Unknown:
-    """An answer that nothing was said of."""
+    """A result type that was not registered."""
 
     value: jax.Array
 
@@ -133,7 +133,7 @@ def unknown(numbers, weights):
     return Unknown(numbers.sum())
 
 
-def test_what_cannot_be_kept_is_compiled_all_the_same(folder):
+def test_a_program_that_cannot_be_kept_is_still_compiled(folder):
     assert call(unknown).value == 6
     assert TRACED == [1]
     assert not list(folder.rglob("*.stablehlo"))
@@ -149,7 +149,7 @@ def test_all_programs_of_the_command_line_can_be_kept(folder):
     assert kept == {"propose", "polish", "solve_pair", "encode_target", "solve_many"}
 
 
-def test_a_folder_that_cannot_be_written_costs_time_and_nothing_else(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_written_costs_only_time(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setattr(programs, "_places", [])
     programs.keep_in(tmp_path / "file")

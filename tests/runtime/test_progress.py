@@ -24,7 +24,7 @@ def test_piped_progress_is_a_few_plain_lines():
     assert "registering: 200 of 200 pairs" in text and "left" in text
 
 
-def test_piped_progress_is_plain_beside_another_that_is_still_open():
+def test_piped_progress_is_plain_while_another_bar_is_open():
     alone = told()
     with Progress(total=3, desc="outer", file=io.StringIO()):
         assert told() == alone
@@ -41,7 +41,7 @@ def test_progress_that_is_turned_off_says_nothing():
     assert told(disable=True) == ""
 
 
-def test_on_a_terminal_the_bar_writes_over_itself():
+def test_on_a_terminal_the_bar_redraws_itself():
     # given
     leader, follower = pty.openpty()
     with open(follower, "w") as terminal:

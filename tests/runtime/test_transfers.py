@@ -1,4 +1,4 @@
-"""Nothing goes between host and device unasked: what is there stays there."""
+"""Nothing is transferred between host and device without being asked for."""
 
 import contextlib
 from unittest import mock
@@ -31,9 +31,9 @@ class HiddenTransferError(Exception):
 
 @contextlib.contextmanager
 def no_transfers():
-    """Refuses what JAX would send, and arrays of more than one number that are fetched.
+    """Refuses implicit transfers to the device, and fetches of arrays with more than one number.
 
-    JAX's own guard does the second only where host and device have memories of their own.
+    JAX's own guard does the second only if host and device have separate memories.
     """
 
     def refusing(fetch):
@@ -76,7 +76,7 @@ def test_what_the_guard_refuses(pair):
 
 
 @pytest.mark.parametrize("call", [1, 2], ids=["compiled in the call", "compiled before"])
-def test_registering_what_is_on_the_device_moves_nothing(params, pair, call):
+def test_registering_clouds_on_the_device_transfers_nothing(params, pair, call):
     for _ in range(call - 1):
         register(params, *pair, settings=SMALL)
 
@@ -87,7 +87,7 @@ def test_registering_what_is_on_the_device_moves_nothing(params, pair, call):
     assert np.isfinite(found.transforms).all() and np.isfinite(encoded.features).all()
 
 
-def test_what_is_not_finite_is_still_refused_and_its_rows_are_told(params, pair):
+def test_points_that_are_not_finite_are_still_refused_by_row(params, pair):
     broken = pair[1].at[jnp.array([5, 7]), 2].set(jnp.inf)
 
     with pytest.raises(ValueError, match="target: row 5 is not finite, and 1 more"):
@@ -96,7 +96,7 @@ def test_what_is_not_finite_is_still_refused_and_its_rows_are_told(params, pair)
         jax.jit(lambda source: register(params, source, broken, settings=SMALL))(pair[0])
 
 
-def test_solving_what_is_on_the_device_moves_nothing(params, pair):
+def test_solving_on_the_device_transfers_nothing(params, pair):
     sides = [
         DeviceCloud(
             cloud[:, :3],
@@ -112,7 +112,7 @@ def test_solving_what_is_on_the_device_moves_nothing(params, pair):
     assert np.isfinite(found.transform).all()
 
 
-def test_a_training_step_moves_nothing(tmp_path):
+def test_a_training_step_transfers_nothing(tmp_path):
     path = samples.write_corpus(tmp_path / "ellipsoids.h5")
     sampling = Sampling(points=samples.POINTS, neighbors=samples.NEIGHBORS)
     batch = batch_at(ShapeSource(read_corpus(path)), 0, samples.BATCH, sampling, seed=0)

@@ -1,4 +1,4 @@
-"""A batch of clouds: in turn on a CPU, side by side elsewhere, the same answers."""
+"""A batch of clouds: one by one on a CPU, side by side elsewhere, with the same results."""
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +11,12 @@ from cfr_jax.runtime.vectorizing import cloud_by_cloud
 
 
 def parts(weights, rows):
-    """Two results, one of them a tuple, as the heavy functions have."""
+    """A function with two results, one of them a tuple, like the heavy functions."""
     return jnp.tanh(rows @ weights["kernel"]), (weights["shift"] + rows.sum(0),)
 
 
 def other(weights, rows):
-    """The same, less exactly."""
+    """The same plus 0.5, which shows that this function ran."""
     return jax.tree.map(lambda part: part + 0.5, parts(weights, rows))
 
 
@@ -25,7 +25,7 @@ ROWS = jnp.asarray(np.random.default_rng(0).normal(size=(5, 6, 3)), jnp.float32)
 
 
 @pytest.mark.parametrize("axes", [(None, 0), ({"kernel": None, "shift": 0}, 0), (None, 1)])
-def test_a_batch_in_turn_is_a_batch(axes):
+def test_a_batch_processed_in_turn_gives_the_same_results(axes):
     weights = dict(WEIGHTS)
     rows = jnp.moveaxis(ROWS, 0, axes[1])
     if axes[0] is not None:
@@ -39,7 +39,7 @@ def test_a_batch_in_turn_is_a_batch(axes):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7)  # of entries of order one
 
 
-def test_each_platform_has_its_own_way():
+def test_each_platform_runs_its_own_function():
     one = jax.jit(cloud_by_cloud(parts, other)).trace(WEIGHTS, ROWS[0])
     batch = jax.jit(jax.vmap(cloud_by_cloud(parts, other), (None, 0))).trace(WEIGHTS, ROWS)
 
@@ -49,7 +49,7 @@ def test_each_platform_has_its_own_way():
             assert ("5.000000e-01" in text) == (platform != "cpu")
 
 
-def test_only_a_cpu_takes_a_batch_in_turn():
+def test_only_a_cpu_processes_a_batch_in_turn():
     batch = jax.jit(jax.vmap(cloud_by_cloud(parts, parts), (None, 0)))
 
     def loops(platform):

@@ -194,7 +194,7 @@ def test_another_config_goes_on_with_a_word(killed_config, tmp_path, capsys):
     run(changed, tmp_path)
 
     told = capsys.readouterr().out
-    assert "going on from step 4" in told and "keep_checkpoints 2 → 3" in told
+    assert "resuming at step 4" in told and "keep_checkpoints 2 → 3" in told
     assert int(state_of(tmp_path).step) == 16
 
 
@@ -207,7 +207,7 @@ def test_a_run_from_before_phases_had_samplings_goes_on_without_a_word(corpus_fi
 
     told = identity.go_on(before, now, 16, tmp_path)
 
-    assert told == ["going on from step 4"] and now["step"] == 4
+    assert told == ["resuming at step 4"] and now["step"] == 4
 
 
 def test_a_workdir_of_other_training_data_is_refused(tmp_path, whole):
@@ -318,7 +318,7 @@ def test_answers_that_are_no_numbers_are_no_validation(monkeypatch):
     monkeypatch.setattr(step, "predict", lambda *_, **__: jax.numpy.asarray(found))
     chosen = learner.learner(config("nowhere.h5"))
 
-    with pytest.raises(stopping.Diverged, match="answers to 1 of 3 validation pairs"):
+    with pytest.raises(stopping.Diverged, match="answers of the weights to 1 of 3 validation"):
         validation.validate(chosen, {}, {}, found[:, 0], devices.make_mesh())
 
 
@@ -380,7 +380,7 @@ def test_weights_to_start_from_have_the_iterations_that_are_asked_for(corpus_fil
     given = config(corpus_file)
     given.train.start_from, given.iterations = str(whole[0] / "weights.safetensors"), 2
 
-    with pytest.raises(ValueError, match="start_from: .*other iterations than .*iterations = 2"):
+    with pytest.raises(ValueError, match="start_from: .*was not made with .*iterations = 2"):
         fresh_params(given, learner.learner(given))
 
 
@@ -412,7 +412,7 @@ def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monk
     monkeypatch.setattr(Board, "close", closed_in_vain)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Checkpoints, "_finish", full_after_step_8)
-        with pytest.raises(SaveError, match="step 12 .*\n?.*last good one is of step 8") as stopped:
+        with pytest.raises(SaveError, match="step 12 .*\n?.*last good one is at step 8") as stopped:
             run(given, tmp_path)
     assert "No space left" in str(stopped.value) and "same command" in str(stopped.value)
     monkeypatch.undo()

@@ -244,7 +244,8 @@ def test_bfloat16_is_of_cfr_alone(corpus_file, tmp_path):
     given = config(corpus_file, precision="bfloat16")
     given.network = "rpmnet"
 
-    with pytest.raises(ValueError, match="precision: got 'bfloat16', which rpmnet does not have"):
+    wanted = "precision: got 'bfloat16', which rpmnet does not support"
+    with pytest.raises(ValueError, match=wanted):
         run(given, tmp_path)
 
 

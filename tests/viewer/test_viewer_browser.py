@@ -1,4 +1,4 @@
-"""The page in a real browser, drawn by WebGL and, where that is missing, by hand."""
+"""The page in a real browser, drawn with WebGL and, without WebGL, by hand."""
 
 import io
 import json
@@ -38,8 +38,8 @@ QUIET = [
 
 @pytest.fixture(scope="module", params=RENDERERS)
 def chromium(request):
-    """One browser for all tests of a renderer; it asks for reduced motion, so that the page
-    stands still until it is told to move."""
+    """One browser for all tests of a renderer. It asks for reduced motion, so that the page does
+    not move by itself."""
     options = selenium.ChromeOptions()
     options.binary_location = CHROMIUM
     for flag in QUIET + RENDERERS[request.param]:
@@ -61,7 +61,7 @@ def prefer(driver, reduced_motion, scheme="light"):
 
 
 class Page:
-    """An open page; after each test it must have asked for nothing and complained of nothing."""
+    """An open page. After each test it must have loaded nothing and logged no errors."""
 
     def __init__(self, driver, path):
         self.driver = driver
@@ -89,7 +89,7 @@ class Page:
             time.sleep(0.05)
 
     def wait_until_still(self):
-        """The station reads 1.000 a frame or two before the motion has ended."""
+        """The station reads 1.000 a frame or two before the motion ends."""
         deadline = time.monotonic() + 20
         while self["play"].get_attribute("data-playing") is not None:
             assert time.monotonic() < deadline, "still playing"
@@ -111,7 +111,7 @@ class Page:
         )
 
     def covered(self, cloud):
-        """Which pixels one cloud covers, seen alone."""
+        """Which pixels one cloud covers if it is shown alone."""
         other = {"source": "target", "target": "source"}[cloud]
         self.click(f"show-{other}")
         covered = drawn(self.pixels())
@@ -120,13 +120,13 @@ class Page:
         return covered
 
     def overlap(self):
-        """Pixels that both clouds cover, by those that either covers."""
+        """The number of pixels that both clouds cover, divided by those that either covers."""
         source, target = self.covered("source"), self.covered("target")
         return (source & target).sum() / (source | target).sum()
 
 
 def drawn(pixels):
-    """Which pixels a point covers: those with a color."""
+    """Which pixels are covered by a point: those with a color."""
     return np.ptp(pixels, axis=2) > 60
 
 
@@ -153,7 +153,7 @@ def open_page(chromium, tmp_path):
 
 
 def make_scene(**changes):
-    """An egg twice; the answer lays one on the other point by point, the way there is crooked."""
+    """Two copies of an egg. The answer brings them together exactly, along a crooked path."""
     rng = np.random.default_rng(0)
     egg = rng.normal(size=(1500, 3))
     egg *= np.array([1.5, 1.0, 0.6]) / np.linalg.norm(egg, axis=1, keepdims=True)
@@ -177,7 +177,7 @@ def make_scene(**changes):
     return Scene(**given | changes)
 
 
-def test_the_source_lies_apart_before_and_on_the_target_after(open_page):
+def test_the_source_is_apart_before_and_on_the_target_after(open_page):
     page = open_page(make_scene())
 
     page.click("after")
@@ -190,7 +190,7 @@ def test_the_source_lies_apart_before_and_on_the_target_after(open_page):
     assert page["station"].text == "start"
 
 
-def test_the_panel_tells_names_counts_facts_and_warnings(open_page):
+def test_the_panel_shows_names_counts_facts_and_warnings(open_page):
     page = open_page(make_scene())
     panel = page.driver.find_element("tag name", "aside").text
     for text in ("left.ply", "right.ply", "source, 1,500 points", "confidence\n0.97", "fitness"):
@@ -198,7 +198,7 @@ def test_the_panel_tells_names_counts_facts_and_warnings(open_page):
     assert page["warnings"].text == "The clouds hardly overlap."
 
 
-def test_hostile_names_are_read_and_not_run(open_page):
+def test_hostile_names_are_shown_and_not_run(open_page):
     attack = "</script><img src=x onerror='document.title=1'><script>document.title=2</script>"
     page = open_page(
         make_scene(

@@ -1,4 +1,4 @@
-"""The page as a file: what it carries, what it allows, what it must never do."""
+"""The page as a file: what it contains, what it allows, and what it must never do."""
 
 import base64
 import hashlib
@@ -84,7 +84,7 @@ def test_the_page_shows_every_station_where_the_transform_puts_the_source(tmp_pa
     def in_units(shown):
         return np.asarray(shown) * view.radii[-1] + view.center
 
-    # Half a step of rounding of clouds about 6 wide, also where a map puts them far away.
+    # Half a rounding step for clouds about 6 wide, also at far map coordinates.
     target = in_units(decode(carried["target"]) + carried["target"]["position"])
     np.testing.assert_allclose(target, scene.target, rtol=0, atol=2e-4)
     for k, station in enumerate(carried["stations"]):
@@ -94,7 +94,7 @@ def test_the_page_shows_every_station_where_the_transform_puts_the_source(tmp_pa
         )
 
 
-def test_weights_are_carried_with_unused_points_marked(tmp_path):
+def test_weights_are_stored_with_unused_points_marked(tmp_path):
     scene = make_scene(count=4, weights=[0.0, 0.5, 7.0, np.nan])
     carried = written(tmp_path, scene).carried()
     levels = np.frombuffer(base64.b64decode(carried["source"]["weights"]), np.uint8)
@@ -178,6 +178,6 @@ def test_a_failed_write_leaves_nothing_behind(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, -5, True])
-def test_a_point_budget_that_is_none_is_refused(tmp_path, count):
+def test_an_invalid_point_budget_is_refused(tmp_path, count):
     with pytest.raises(ValueError, match="max_points"):
         write_page(tmp_path / "page.html", make_scene(), max_points=count)

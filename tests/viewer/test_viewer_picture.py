@@ -1,4 +1,4 @@
-"""The picture: both panels drawn, at one scale, the same each time, without a display."""
+"""The picture: both panels are drawn at one scale, always the same, without a display."""
 
 import sys
 import warnings
@@ -31,7 +31,7 @@ def make_scene(shift=(0.4, 0.3, 0.0), **changes):
 
 
 def colored(path):
-    """Where the panels are yellow and where blue, as (x, y) in pixels, per panel."""
+    """The yellow and the blue pixels of each panel, as (x, y)."""
     from matplotlib.image import imread
 
     image = imread(path)[:, :, :3]
@@ -45,13 +45,13 @@ def colored(path):
 
 
 @needs_matplotlib
-def test_the_clouds_lie_apart_before_and_on_one_another_after(tmp_path):
+def test_the_clouds_are_apart_before_and_overlap_after(tmp_path):
     write_picture(tmp_path / "picture.png", make_scene(shift=(1.5, 1.0, 0.0)))
     (yellow, blue), (yellow_after, blue_after) = colored(tmp_path / "picture.png")
 
     one, apart, together = len(blue), len(yellow) + len(blue), len(yellow_after) + len(blue_after)
     assert one > 1000 and apart > 1.5 * one
-    # Equal clouds in equal places cover what one of them covers.
+    # Two equal clouds in the same place cover the same pixels as one.
     assert together == pytest.approx(one, rel=0.05)
     assert np.linalg.norm(yellow.mean(axis=0) - blue.mean(axis=0)) > 100
 
@@ -91,7 +91,7 @@ def test_the_same_scene_gives_the_same_file_and_no_other(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.png"]
 
 
-def test_without_matplotlib_one_line_names_the_way_out(tmp_path, monkeypatch):
+def test_without_matplotlib_one_line_says_how_to_install_it(tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)

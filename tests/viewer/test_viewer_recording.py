@@ -1,4 +1,4 @@
-"""The Rerun recording, read back by Rerun itself where it is installed."""
+"""The Rerun recording, read back by Rerun itself if it is installed."""
 
 import sys
 

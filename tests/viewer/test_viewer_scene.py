@@ -1,4 +1,4 @@
-"""The scene: what it accepts, what it refuses, and where it is looked at from."""
+"""The scene: what it accepts, what it refuses, and from where the camera sees it."""
 
 import numpy as np
 import pytest
@@ -112,6 +112,6 @@ def test_the_frame_holds_a_distant_start_and_ignores_a_stray_point():
     assert 30 < view.radii[0] < 33 and 0.9 < view.radii[1] < 1.2
 
 
-def test_clouds_of_one_point_have_a_frame_too():
+def test_clouds_of_one_point_also_have_a_frame():
     view = best_view(Scene(**arguments(source=[[4e6, 0, 0]], target=[[4e6, 0, 0]])))
     assert np.isfinite(view.rotation).all() and (view.radii > 0).all()

@@ -1,4 +1,4 @@
-"""Converting the published checkpoints: every tensor finds its place, or is named."""
+"""Conversion of published checkpoints: every tensor finds its place or is named in an error."""
 
 import sys
 import types
@@ -32,7 +32,7 @@ def test_the_tree_is_that_of_fresh_parameters(iterations, conv_rank):
     assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), params) == jax.tree.map(
         lambda leaf: (leaf.shape, leaf.dtype), wanted
     )
-    # every number of the checkpoint is there once: all are different
+    # every number of the checkpoint occurs exactly once, because all are different
     theirs = np.sort(np.concatenate([value.ravel() for value in state.values()]))
     ours = np.sort(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(params)]))
     np.testing.assert_array_equal(ours, theirs)
@@ -60,7 +60,7 @@ def test_files_without_torch_give_what_the_tensors_give(tmp_path, suffix):
 
 @pytest.mark.parametrize("wrapped", [True, False])
 def test_a_pytorch_file_is_read_as_tensors_alone(tmp_path, monkeypatch, wrapped):
-    # torch itself is too large for the tests: a stand-in shows what is asked of it
+    # torch itself is too large for the tests, so a stand-in records how it is called
     state = authors.random_state_dict(2)
 
     class Tensor:
@@ -86,7 +86,7 @@ def test_a_pytorch_file_is_read_as_tensors_alone(tmp_path, monkeypatch, wrapped)
     same(convert(path), from_state_dict(state))
 
 
-def test_without_torch_the_way_out_is_told(tmp_path, monkeypatch):
+def test_without_torch_the_message_says_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     path = tmp_path / "authors.pth"
     path.write_bytes(b"")
@@ -138,7 +138,7 @@ def test_a_gap_among_the_iterations_is_named():
         from_state_dict(state)
 
 
-def test_rpmnet_is_told_by_its_names():
+def test_rpmnet_is_recognized_by_its_names():
     # given a checkpoint that lacks a tensor, and another whole
     broken = authors.random_rpmnet_state_dict(0, conv_rank=4)
     del broken["feat_extractor.postpool.3.bias"]
@@ -164,7 +164,7 @@ def test_a_damaged_file_is_refused(tmp_path, suffix):
     path = tmp_path / f"authors{suffix}"
     path.write_bytes(b"PK\x03\x04 nothing of the kind" * 9)
 
-    with pytest.raises(ValueError, match="no readable checkpoint"):
+    with pytest.raises(ValueError, match="is not a readable checkpoint"):
         convert(path)
 
 
@@ -172,5 +172,5 @@ def test_objects_in_a_file_are_never_unpickled(tmp_path):
     path = tmp_path / "authors.npz"
     np.savez(path, **{"weights_net.prepool.0.weight": np.array([{"an": "object"}], object)})
 
-    with pytest.raises(ValueError, match="no readable checkpoint"):
+    with pytest.raises(ValueError, match="is not a readable checkpoint"):
         convert(path)

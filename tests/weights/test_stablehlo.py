@@ -1,4 +1,4 @@
-"""The exported program: the same answer, on any platform, without this package."""
+"""The exported program: the same results on any platform, without this package."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def tiny():
 
 
 def cloud(count, seed):
-    """Points on an egg and their normals, (count, 6)."""
+    """Points on an egg, with normals, (count, 6)."""
     points = np.random.default_rng(seed).normal(size=(count, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     return np.hstack([points * [0.9, 0.6, 0.4], points]).astype(np.float32)
@@ -49,7 +49,7 @@ def written(tiny, tmp_path_factory):
     return path
 
 
-def test_an_exported_program_answers_as_register_does(tiny, written):
+def test_an_exported_program_gives_the_results_of_register(tiny, written):
     # given
     source, target = cloud(48, 0), cloud(40, 1)
 
@@ -64,8 +64,8 @@ def test_an_exported_program_answers_as_register_does(tiny, written):
         np.testing.assert_allclose(found[name], getattr(wanted, name), atol=1e-5)
 
 
-def test_a_program_for_accelerators_calls_nothing_that_only_a_cpu_has(tiny):
-    """Also where it estimates the normals itself; LAPACK and callbacks into Python are calls."""
+def test_a_program_for_accelerators_has_no_calls_that_only_a_cpu_supports(tiny):
+    """Also if it estimates the normals itself. LAPACK and callbacks into Python would be calls."""
     exported = export_register(
         tiny, points=CAPACITY, platforms=("cpu", "cuda", "rocm", "tpu"), settings=SETTINGS
     )
@@ -75,7 +75,7 @@ def test_a_program_for_accelerators_calls_nothing_that_only_a_cpu_has(tiny):
 
 
 @pytest.mark.slow
-def test_any_number_of_pairs_goes_through_a_batched_program(tiny, written):
+def test_a_batched_program_takes_any_number_of_pairs(tiny, written):
     # given
     exported = export_register(tiny, points=CAPACITY, normals=True, batch=True, settings=SETTINGS)
     pairs = [(cloud(48, 0), cloud(40, 1)), (cloud(64, 2), cloud(50, 3))]
@@ -103,7 +103,7 @@ def test_clouds_that_do_not_fit_the_program_are_refused_by_name(written, uncheck
         loaded(cloud(65, 0), fine)
     with pytest.raises(ValueError, match=r"target: got shape \(40, 3\), wanted \(n, 6\)"):
         loaded(fine, fine[:, :3])
-    with pytest.raises(ValueError, match="target: holds values that are not finite"):
+    with pytest.raises(ValueError, match="target: got values that are not finite"):
         loaded(fine, fine * np.float32(np.nan))
 
 
@@ -117,7 +117,7 @@ def test_what_cannot_be_exported_is_refused_by_name(tiny, unchecked):
 @pytest.mark.parametrize("content", [b"", b"nonsense", bytes(range(256)) * 9])
 def test_a_file_that_holds_no_program_is_refused_by_name(content, tmp_path):
     (tmp_path / "model.stablehlo").write_bytes(content)
-    with pytest.raises(ValueError, match="model.stablehlo: is no exported program"):
+    with pytest.raises(ValueError, match="model.stablehlo is not an exported program"):
         load_exported(tmp_path / "model.stablehlo")
 
 
@@ -146,14 +146,14 @@ def test_the_command_writes_a_program_and_says_what_it_takes(tiny, tmp_path, cap
         (["--out", "model.onnx"], "wanted a name that ends in .stablehlo"),
     ],
 )
-def test_the_command_refuses_what_it_cannot_write(options, told, tmp_path, monkeypatch, capsys):
+def test_the_command_refuses_what_it_cannot_export(options, told, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["export", "--out", "model.stablehlo", *options]) == 2
     assert told in capsys.readouterr().err and list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
-def test_the_example_needs_only_jax_and_numpy_and_answers_in_the_callers_frame(tiny, tmp_path):
+def test_the_example_needs_only_jax_and_numpy_and_uses_the_callers_frame(tiny, tmp_path):
     # given
     imported = {
         name.name.partition(".")[0]

@@ -1,4 +1,4 @@
-"""Weights on disk: what was saved comes back, and nothing else does."""
+"""Weights on disk: saved weights are read back, and all other files are refused."""
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +51,7 @@ def test_the_calibration_comes_back_with_the_weights(fresh, tmp_path):
     assert jax.tree.leaves(found.params)[0].dtype == jnp.float32
     save_params(tmp_path / "again.safetensors", found.params, found.notes)
     assert read_weights(tmp_path / "again.safetensors").sha256 == found.sha256
-    # other coefficients are other weights, and none are none
+    # other coefficients give another digest, and weights without coefficients have none
     save_params(path, fresh, {"made_by": "a test"})
     bare = read_weights(path)
     assert calibration_of(bare.params) is None and bare.sha256 != found.sha256
@@ -60,12 +60,15 @@ def test_the_calibration_comes_back_with_the_weights(fresh, tmp_path):
 @pytest.mark.parametrize(
     ("fitted", "told"),
     [
-        ("nonsense", "the note is no JSON"),
-        ('{"register": {"bias": 1}, "align": {"bias": 1}}', "register has other clues than are"),
+        ("nonsense", "the note is not valid JSON"),
+        (
+            '{"register": {"bias": 1}, "align": {"bias": 1}}',
+            "register has other clues than this version",
+        ),
     ],
 )
 def test_a_damaged_calibration_is_refused(fresh, tmp_path, monkeypatch, fitted, told):
-    # given a file whose digest fits, since it was written with that note
+    # given a file whose digest matches, because it was written with that note
     monkeypatch.setattr(Calibration, "write", lambda _: fitted)
     path = tmp_path / "damaged.safetensors"
     save_params(path, {**fresh, KEY: Calibration.of({"bias": 0.0}, {"bias": 0.0})})
@@ -75,8 +78,8 @@ def test_a_damaged_calibration_is_refused(fresh, tmp_path, monkeypatch, fitted, 
 
 
 @pytest.mark.parametrize("name", [KEY, "sha256"])
-def test_notes_that_are_written_by_themselves_cannot_be_given(fresh, tmp_path, name):
-    with pytest.raises(ValueError, match=f"notes: got '{name}'"):
+def test_reserved_names_of_notes_are_refused(fresh, tmp_path, name):
+    with pytest.raises(ValueError, match=f"notes: got the reserved name '{name}'"):
         save_params(tmp_path / "w.safetensors", fresh, {name: "{}"})
     assert not list(tmp_path.iterdir())
 
@@ -84,11 +87,11 @@ def test_notes_that_are_written_by_themselves_cannot_be_given(fresh, tmp_path, n
 def test_tensors_of_no_network_are_refused(tmp_path):
     path = tmp_path / "other.safetensors"
     save_params(path, {"nobody": np.zeros(3, np.float32)})
-    with pytest.raises(ValueError, match="other.*no network that is known .* tensors: nobody"):
+    with pytest.raises(ValueError, match="other.*no known network .* tensors: nobody"):
         read_weights(path)
 
 
-def test_the_same_weights_have_the_same_digest_and_others_another(fresh, saved, tmp_path):
+def test_weights_have_the_same_digest_only_if_they_are_equal(fresh, saved, tmp_path):
     other = tmp_path / "other.safetensors"
     digest = read_weights(saved).sha256
 
@@ -122,7 +125,7 @@ def test_a_truncated_file_is_refused(saved, share):
     content = saved.read_bytes()
     saved.write_bytes(content[: int(share * len(content))])
 
-    with pytest.raises(ValueError, match="no readable safetensors file"):
+    with pytest.raises(ValueError, match="is not a readable safetensors file"):
         read_weights(saved)
 
 
@@ -169,11 +172,11 @@ def test_a_file_of_someone_else_is_refused(saved, tmp_path):
     path = tmp_path / "theirs.safetensors"
     save_file(load_file(saved), path)
 
-    with pytest.raises(ValueError, match="carries no digest"):
+    with pytest.raises(ValueError, match="has no digest, so cfr_jax did not write it"):
         read_weights(path)
 
 
-def test_an_unknown_name_tells_what_ships():
+def test_an_unknown_name_is_answered_with_the_shipped_names():
     with pytest.raises(ValueError, match="no file and no shipped weights called 'nowhere'"):
         read_weights("nowhere")
 

@@ -1,4 +1,4 @@
-"""A result that `cfr register --json` wrote, and the clouds it speaks of: ready to be drawn."""
+"""Reads a result that `cfr register --json` wrote, with its two clouds, to draw it."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ _NEEDED: dict[str, type | tuple[type, ...]] = {
     "warnings": list,
     "seed": int,
 }
-_COMPARED = 2_000  # points of the source whose distances are taken again
-# The result measured thinned clouds, and here all points are: a good fit may look a little better
-# or worse, a changed file looks like another one.
+_COMPARED = 2_000  # points of the source whose distances are measured again
+# The result was measured on thinned clouds, but here on all points: so a good fit may look a little
+# better or worse. A changed file makes a much larger difference.
 _WORSE = 0.25
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """The document in `path`; raises ValueError, naming the file, for anything else."""
+    """The document in `path`; raises a ValueError that names the file if it holds anything else."""
     try:
         if path.is_dir():
             raise ValueError("is a folder")
         if path.stat().st_size > _LARGEST_FILE:
-            raise ValueError("is too large for one")
+            raise ValueError("is too large")
         document = json.loads(path.read_bytes())
         if not isinstance(document, dict):
             raise ValueError(f"holds a {type(document).__name__}")
@@ -52,7 +52,7 @@ def read_result(path: Path) -> dict[str, Any]:
                 raise ValueError(f'has no usable "{name}"')
         for role in ("source", "target"):
             if not isinstance(document[role].get("path"), str):
-                raise ValueError(f'does not say where its "{role}" lies')
+                raise ValueError(f'does not say where its "{role}" is')
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
@@ -61,10 +61,11 @@ def read_result(path: Path) -> dict[str, Any]:
 
 
 def find_cloud(document: dict[str, Any], role: str, result: Path, given: Path | None) -> Path:
-    """Where the `role` ("source" or "target") of `document` lies now.
+    """The current path of the `role` ("source" or "target") of `document`.
 
-    `given` if there is one; else the path in the document, from here or from the folder of the
-    result. Raises ValueError if the file is in neither place.
+    It is `given`, if that is not None. Otherwise it is the path in the document, seen from the
+    current folder or from the folder of the result, or a file of that name beside the result.
+    Raises ValueError if there is no such file.
     """
     if given is not None:
         return given
@@ -73,27 +74,29 @@ def find_cloud(document: dict[str, Any], role: str, result: Path, given: Path | 
         if place.exists():
             return place
     raise ValueError(
-        f"{role}: {noted}, which {result.name} is about, is not there any more, nor beside it; "
-        f"--{role} FILE says where it lies now"
+        f"{role}: {noted}, which {result.name} was made from, does not exist, nor does a file of "
+        f"that name beside the result; give --{role} FILE to say where it is now"
     )
 
 
 def read_clouds(document: dict[str, Any], paths: dict[str, Path]) -> dict[str, PointCloud]:
-    """The two clouds, sampled as they were; ValueError if one has other points than it had."""
+    """The two clouds, sampled as before; raises ValueError if a number of points has changed."""
     clouds = {role: io.read(path, seed=document["seed"]) for role, path in paths.items()}
     for role, cloud in clouds.items():
         had = document[role].get("points", len(cloud))
         if len(cloud) != had:
             raise ValueError(
-                f"{role}: {paths[role]} has {len(cloud):,} points, the result is about {had}: "
-                f"another file? --{role} FILE names the right one"
+                f"{role}: {paths[role]} has {len(cloud):,} points, but the result was made from "
+                f"{had}; give --{role} FILE if it is a different file"
             )
     return clouds
 
 
 def as_scene(document: dict[str, Any], source: PointCloud, target: PointCloud) -> Scene:
-    """What `report.as_scene` drew of the same result, without the correspondence weights, which
-    are not saved. Raises ValueError for transforms that are none."""
+    """The scene that `report.as_scene` made of the same result, without correspondence weights.
+
+    These weights are not saved. Raises ValueError if the transforms are not rigid motions.
+    """
     stations, labels = report.way(
         document.get("initial"),
         document["transforms"],
@@ -117,17 +120,17 @@ def as_scene(document: dict[str, Any], source: PointCloud, target: PointCloud) -
 
 
 def _doubts(document: dict[str, Any], source: PointCloud, target: PointCloud) -> Iterator[str]:
-    """The warnings of the result, and one more if its clouds do not fit as they did."""
+    """Yields the warnings of the result, and one more if its clouds no longer fit as before."""
     yield from document["warnings"]
     rows = np.random.default_rng(0).permutation(len(source))[:_COMPARED]
     transform = np.asarray(document["transform"], np.float64)
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
-        return  # the scene says so
+        return  # the scene raises the error
     moved = motions.apply(transform, source.points[rows])
     away = cKDTree(target.points).query(moved)[0]
     fitness = float((away <= document["inlier_distance"]).mean())
     if fitness < document["fitness"] - _WORSE:
         yield (
-            f"the clouds do not fit as they did (fitness {fitness:.2f}, and it was "
+            f"the clouds do not fit as they did before (fitness {fitness:.2f}; it was "
             f"{document['fitness']:.2f}): were the files changed?"
         )

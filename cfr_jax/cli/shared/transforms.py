@@ -1,4 +1,4 @@
-"""A 4x4 transform from a file."""
+"""Reads a 4x4 transform from a file."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ def read_transform(path: Path) -> Float64[np.ndarray, "4 4"]:
     """The matrix in a text file of 16 numbers, a .npy, or a .json.
 
     JSON holds the matrix as four rows, or is an object with such a "transform", as
-    `cfr register --json` writes. Raises ValueError, naming the file, for anything but 16 finite
-    numbers; whether they are a rigid motion is for whoever uses them to say.
+    `cfr register --json` writes it. Raises a ValueError that names the file for anything but 16
+    finite numbers. This does not check whether they are a rigid motion.
     """
     try:
         if path.stat().st_size > _LARGEST_FILE:
             raise ValueError("is too large for a 4x4 matrix")
         matrix = _parse(path)
-        # Text may come as one row of sixteen or four rows of four.
+        # Text becomes one row of sixteen; other files may hold four rows of four.
         if matrix.shape not in ((4, 4), (16,)):
             raise ValueError(f"holds numbers of the shape {matrix.shape}")
         if not np.isfinite(matrix).all():
@@ -42,7 +42,7 @@ def _parse(path: Path) -> np.ndarray:
             value = json.loads(path.read_bytes())
             if isinstance(value, dict):
                 if "transform" not in value:
-                    raise ValueError('holds no "transform"')
+                    raise ValueError('has no "transform"')
                 value = value["transform"]
             return np.asarray(value, np.float64)
         case _:

@@ -1,7 +1,7 @@
-"""The table of kinds of data: one file each, and everyone who opens data looks here.
+"""The table of kinds of data, with one file per kind. All code that opens data looks here.
 
-`add_kind` adds one from outside. Neither the table nor the files below it import what reads data
-before it is read, so that help texts can show the table.
+`add_kind` adds a kind from outside. Neither the table nor its files import readers before data is
+read, so that help texts can show the table quickly.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from collections.abc import Iterable
 from cfr_jax.data.kinds import clouds, corpus, kitti, meshes, modelnet40, pair_file, pair_list
 from cfr_jax.data.kinds.kind import DataKind
 
-# In the order in which they are tried.
+# In the order in which recognition tries them.
 _KINDS: list[DataKind] = [
     pair_list.KIND,
     pair_file.KIND,
-    modelnet40.KIND,  # before `corpus`: it is one, too
+    modelnet40.KIND,  # before `corpus`, because it is a corpus, too
     corpus.KIND,
     kitti.KIND,
     clouds.KIND,
     meshes.KIND,
 ]
-# What configs called some of them before there was one vocabulary.
+# Names in older configs, from before all code shared one vocabulary.
 _RENAMED = {
     "shapes": "corpus",
     "pairs": "pair-list (a CSV list) or pair-file (HDF5)",
@@ -30,15 +30,15 @@ _RENAMED = {
 
 
 def known() -> tuple[DataKind, ...]:
-    """All kinds of data, in the order in which they are tried."""
+    """All kinds of data, in the order in which recognition tries them."""
     return tuple(_KINDS)
 
 
 def add_kind(new: DataKind) -> None:
-    """Adds a kind of data to the table: `cfr batch`, `train.py` and `evaluate.py` then know it.
+    """Adds a kind of data to the table for `cfr batch`, `train.py` and `evaluate.py`.
 
-    It is tried before all others, since a folder of its own layout may look like one of clouds.
-    Raises ValueError where its name is taken.
+    Recognition tries it before all others, because a folder with a new layout may look like a
+    folder of clouds. Raises ValueError if the name is taken.
     """
     if new.name == "auto" or any(new.name == kind.name for kind in _KINDS):
         raise ValueError(f"name: {new.name!r} is taken, wanted another")
@@ -46,7 +46,8 @@ def add_kind(new: DataKind) -> None:
 
 
 def named(name: str, where: str, among: Iterable[DataKind]) -> DataKind:
-    """The kind of that name; raises ValueError, naming the field `where`, if it is not `among`."""
+    """The kind with this name. Raises ValueError, naming the field `where`, if it is not in
+    `among`."""
     by_name = {kind.name: kind for kind in among}
     if name in by_name:
         return by_name[name]

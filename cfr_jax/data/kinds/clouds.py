@@ -1,4 +1,4 @@
-"""A folder of point clouds, in any formats that `cfr_jax.io` reads."""
+"""A folder of point clouds, in any format that `cfr_jax.io` reads."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ if TYPE_CHECKING:
 
 
 def recognize(path: Path) -> str | None:
-    """By the suffixes of the files below it, and the headers of those that may have faces."""
+    """Looks at the suffixes of all files in the folder, and at the headers of those that may have
+    faces."""
     return in_words("point clouds", count_loose(path, formats.of_clouds(), surfaces=False))
 
 
 def unlikely(path: Path) -> bool:
-    """Whether there are more meshes: a readme.txt beside them is no cloud."""
+    """Whether there are more meshes than clouds: a readme.txt beside meshes is not a cloud."""
     clouds = count_loose(path, formats.of_clouds(), surfaces=False)
     return meshes.count(path).total() > clouds.total()
 
 
 def train(path: str | Path, cache: Path) -> SceneSource:
-    """Two views of one cloud each: nobody has to know how clouds lie to each other."""
+    """Pairs of two views of one cloud, which need no known motion between clouds."""
     import numpy as np
 
     from cfr_jax import io
@@ -36,7 +37,7 @@ def train(path: str | Path, cache: Path) -> SceneSource:
 
     folder = Path(path)
     if not folder.is_dir():
-        raise ValueError(f"no folder of scans at {folder}")
+        raise ValueError(f"path: there is no folder of scans at {folder}")
     files = list_scans(folder)
 
     def read(row: int) -> Pair:
@@ -55,7 +56,7 @@ def train(path: str | Path, cache: Path) -> SceneSource:
 
 
 def list_scans(path: Path) -> list[Path]:
-    """Every file below the folder in a format of clouds, but for hidden ones."""
+    """All files in the folder and its subfolders in a format of clouds, except hidden ones."""
     return loose_files(path, formats.of_clouds())
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def recognize(path: Path) -> str | None:
-    """A file with `data`, or a folder of HDF5 files with the names of their categories."""
+    """An HDF5 file with `data`, or a folder of HDF5 files with a `shape_names.txt`."""
     if path.is_dir():
         files = [file for file in path.iterdir() if file.suffix in HDF5_SUFFIXES]
         if files and (path / "shape_names.txt").is_file():
@@ -26,21 +26,21 @@ def recognize(path: Path) -> str | None:
 
 
 def train(path: str | Path, cache: Path) -> ShapeSource:
-    """Two views of a shape each."""
+    """Pairs of two views of one shape."""
     from cfr_jax.data.sources import ShapeSource
 
     return ShapeSource(read_shapes(path))
 
 
 def evaluate(path: str | Path, cache: Path, *, protocol: str) -> Sequence[Pair]:
-    """A pair of each shape, by a protocol that `data.protocol` knows by name."""
+    """One pair per shape, by a protocol that is named in `data.protocol`."""
     from cfr_jax.data.protocol import fixed_pairs
 
     return fixed_pairs(read_shapes(path), protocol)
 
 
 def read_shapes(path: str | Path) -> Corpus:
-    """All of them."""
+    """The whole corpus."""
     from cfr_jax.data.corpus import read_corpus
 
     return read_corpus(path)

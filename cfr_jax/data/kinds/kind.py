@@ -1,4 +1,4 @@
-"""What the project has to know about one kind of data."""
+"""The record that describes one kind of data to the rest of the package."""
 
 from __future__ import annotations
 
@@ -16,56 +16,59 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Listing:
-    """Pairs by their names, and how to read each; no cloud is read yet."""
+    """Names of pairs, and how to read each one. No cloud has been read yet."""
 
     names: Sequence[tuple[str, str]]
     """Source and target of each pair."""
     pairs: Sequence[Any]
-    """The same pairs as `align_many` takes them: two files, or a function that reads two clouds."""
+    """The same pairs as input for `align_many`: two files, or a function that reads two clouds."""
     how: str
-    """In words, what was paired with what."""
+    """What was paired with what, in words."""
 
 
 @dataclass(frozen=True)
 class DataKind:
-    """One kind of data: how it is recognized, and what each room may do with it.
+    """One kind of data: how it is recognized, and what can be done with it.
 
-    A function that is None says that the data are not for that. Openers get a path and a folder
-    `cache`, in which they may keep what took long to compute; their keyword-only parameters are the
-    settings that a config may give, those without a default the ones that it has to give. They
-    raise ValueError, naming the path or the setting, where the data cannot be used.
+    A function that is None means that the data cannot be used that way. `train` and `evaluate` get
+    a path and a folder `cache`, where they may keep results that take long to compute. Their
+    keyword-only parameters are the settings that a config may give; those without a default are
+    required. They raise ValueError, naming the path or the setting, if the data cannot be used.
     """
 
     name: str
-    """What configs and `--layout` call it."""
+    """The name in configs and for `--layout`."""
     words: str
-    """What it is, for help texts and messages; begins with an article."""
+    """A description for help texts and messages; begins with an article."""
     recognize: Callable[[Path], str | None]
-    """What was found at a path, in words, or None if it is not of this kind.
+    """Says in words what was found at a path; None if it is not of this kind.
 
-    Looks at names and first bytes only, so that it takes no time.
+    Looks at names and first bytes only, so that it is fast.
     """
     unlikely: Callable[[Path], bool] | None = None
-    """Whether data that fit are more likely of another kind; then they are of this one only if a
-    user says so."""
+    """Whether data that `recognize` accepts is more likely of another kind. If so, it is taken as
+    this kind only if the user says so."""
     train: Callable[..., TrainingSource] | None = None
-    """`train(path, cache, *, settings)`: what training pairs are drawn from; the easiest way to one
-    is `data.scenes.scene_source`."""
+    """`train(path, cache, *, settings)`: a source of training pairs. The easiest way to make one is
+    `data.scenes.scene_source`."""
     evaluate: Callable[..., Sequence[Pair]] | None = None
-    """`evaluate(path, cache, *, settings)`: the pairs to measure on, each with its true transform;
-    a list, or `data.pairs.PairsOnDemand`."""
+    """`evaluate(path, cache, *, settings)`: the pairs to evaluate, each with its true transform, as
+    a list or as `data.pairs.PairsOnDemand`."""
     example: str = ""
     """The file in configs/ that evaluates such data, with all settings."""
     list_pairs: Callable[[Path], Listing] | None = None
-    """For `cfr batch`: the pairs, where the data say themselves which these are."""
+    """For `cfr batch`: the pairs, if the data itself defines them."""
     list_scans: Callable[[Path], list[Path]] | None = None
-    """For `cfr batch`: files of a cloud each, in order, which it pairs."""
+    """For `cfr batch`: files with one cloud each, in order, which `cfr batch` then pairs."""
     read_shapes: Callable[[Path], Corpus] | None = None
-    """For `cfr data info`."""
+    """For `cfr data info`: the shapes."""
 
 
 def settings_of(opener: Callable[..., Any]) -> tuple[set[str], set[str]]:
-    """The settings that an opener needs, and all that it takes: its keyword-only parameters."""
+    """The settings that `train` or `evaluate` requires, and all that it accepts.
+
+    Settings are its keyword-only parameters.
+    """
     given = [
         parameter
         for parameter in inspect.signature(opener).parameters.values()

@@ -1,4 +1,4 @@
-"""Drives in the layout of KITTI odometry (`data.kitti`)."""
+"""LiDAR sequences in the layout of KITTI odometry (`data.kitti`)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def recognize(path: Path) -> str | None:
-    """A folder `sequences/NN/velodyne` with scans."""
+    """Looks for folders `sequences/NN/velodyne` with scans."""
     scans = {name: files for name, files in _sequences(path).items() if files}
     if not scans:
         return None
@@ -31,10 +31,10 @@ def train(
     stride: int = 1,
     frames: tuple[int, int] | None = None,
 ) -> SceneSource:
-    """Frames `distances` meters apart, with refined truths, which are kept in `cache`.
+    """Pairs of frames that are `distances` meters apart, with refined true motions.
 
-    A pair starts every `stride` frames; both of its frames lie from the first of `frames` up to,
-    not including, the second (None: all).
+    The refined motions are kept in `cache`. A pair starts every `stride` frames. Both of its frames
+    lie in the half-open range `frames` (None: all).
     """
     from cfr_jax.data import kitti
     from cfr_jax.data.pairs import Pair, among
@@ -77,9 +77,10 @@ def evaluate(
     translation: float,
     frames: tuple[int, int] | tuple[()] | None = None,
 ) -> Sequence[Pair]:
-    """Frames `distance` meters apart, thinned to `points` and moved at random (`kitti.scan_pair`).
+    """Pairs of frames that are `distance` meters apart, thinned to `points` and moved at random.
 
-    With a `stride` of 0 the next pair starts after the last, as published.
+    See `kitti.scan_pair`. With a `stride` of 0, the next pair starts after the end of the last one,
+    as published.
     """
     from cfr_jax.data import kitti
     from cfr_jax.data.pairs import PairsOnDemand, among
@@ -109,7 +110,7 @@ def evaluate(
 
 
 def list_scans(path: Path) -> list[Path]:
-    """The scans of all sequences, one sequence after the other."""
+    """The scans of all sequences, one sequence after another."""
     return [file for files in _sequences(path).values() for file in files]
 
 

@@ -1,4 +1,4 @@
-"""A folder of meshes, of which `cfr data build` makes a corpus."""
+"""A folder of meshes, from which `cfr data build` makes a corpus."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from cfr_jax.io import formats
 
 
 def count(path: Path) -> Counter[str]:
-    """How many meshes of each suffix are below a folder."""
+    """How many meshes of each suffix are in a folder and its subfolders."""
     return count_loose(path, mesh_formats(), surfaces=True)
 
 
 def recognize(path: Path) -> str | None:
-    """By the suffixes of the files below it, and the headers of those that may have no faces."""
+    """Looks at the suffixes of all files in the folder, and at the headers of those that may have
+    no faces."""
     return in_words("meshes", count(path))
 
 
 def list_scans(path: Path) -> list[Path]:
-    """The meshes that `cfr_jax.io` reads, too."""
+    """The meshes in formats that `cfr_jax.io` also reads."""
     return loose_files(path, formats.of_surfaces())
 
 

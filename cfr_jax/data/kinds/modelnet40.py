@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def recognize(path: Path) -> str | None:
-    """HDF5 files, and the two lists of them."""
+    """Looks for the two lists of HDF5 files."""
     lists = ("train_files.txt", "test_files.txt")
     if not path.is_dir() or not all((path / name).is_file() for name in lists):
         return None
@@ -25,7 +25,7 @@ def recognize(path: Path) -> str | None:
 def evaluate(
     path: str | Path, cache: Path, *, split: Literal["train", "val", "test"], protocol: str
 ) -> Sequence[Pair]:
-    """A pair of each shape of a published split."""
+    """One pair per shape of a published split."""
     from cfr_jax.data.modelnet import read_modelnet40
     from cfr_jax.data.protocol import fixed_pairs
 

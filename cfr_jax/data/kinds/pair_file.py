@@ -1,4 +1,4 @@
-"""An HDF5 file, a group a pair (`data.pairs`)."""
+"""An HDF5 file with one group per pair (`data.pairs`)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def recognize(path: Path) -> str | None:
-    """HDF5 with groups, and nothing of a corpus."""
+    """An HDF5 file with groups, but without the members of a corpus."""
     names, groups = hdf5_members(path)
     if groups and not {"data", "label"} & set(names):
         return f"{len(groups)} pairs in one HDF5 file"
@@ -23,8 +23,10 @@ def recognize(path: Path) -> str | None:
 
 
 def train(path: str | Path, cache: Path, *, frames: tuple[int, int] | None = None) -> SceneSource:
-    """The pairs whose `source_frame` and `target_frame` both lie from the first of `frames` up to,
-    not including, the second (None: all); each needs its truth."""
+    """The pairs with `source_frame` and `target_frame` in the half-open range `frames`.
+
+    None means all pairs. Each pair needs its true transform.
+    """
     from cfr_jax.data.pairs import Hdf5Pairs, among, with_truth
     from cfr_jax.data.scenes import scene_source
 
@@ -32,8 +34,8 @@ def train(path: str | Path, cache: Path, *, frames: tuple[int, int] | None = Non
     numbers = [held.frames(row) for row in range(len(held))]
     if frames is not None and not all(isinstance(n, int) for pair in numbers for n in pair):
         raise ValueError(
-            f"frames: {path} does not say from which frames its pairs are; "
-            "make a file of its own for each use"
+            f"frames: {path} does not say from which frames its pairs come; "
+            "make a separate file for each use"
         )
     rows = [row for row in range(len(held)) if among(frames, numbers[row])]
     where = str(held.path.resolve())
@@ -49,7 +51,8 @@ def train(path: str | Path, cache: Path, *, frames: tuple[int, int] | None = Non
 def evaluate(
     path: str | Path, cache: Path, *, frames: tuple[int, int] | tuple[()] | None = None
 ) -> Sequence[Pair]:
-    """The pairs of these frames, as in training; those that do not say their frames are in none."""
+    """The pairs in the range `frames`, as in training. Pairs without frame numbers are in no range;
+    without `frames`, all pairs are used."""
     from cfr_jax.data.pairs import Hdf5Pairs, PairsOnDemand, among
 
     held = Hdf5Pairs(path)
@@ -60,7 +63,7 @@ def evaluate(
 
 
 def list_pairs(path: Path) -> Listing:
-    """The groups, each read when it is its turn."""
+    """The groups. Each is read only when its turn comes."""
     from cfr_jax.data.pairs import Hdf5Pairs
 
     held = Hdf5Pairs(path)

@@ -1,4 +1,4 @@
-"""A CSV list, a line a pair of files (`data.pairs`)."""
+"""A CSV list with one pair of files per line (`data.pairs`)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SUFFIXES = (".csv", ".tsv", ".txt")
 
 
 def recognize(path: Path) -> str | None:
-    """By the suffix; how many lines there are is told, not whether each is a pair."""
+    """Looks at the suffix and counts the lines, but does not check whether each is a pair."""
     if not path.is_file() or path.suffix.lower() not in _SUFFIXES:
         return None
     try:
@@ -24,11 +24,12 @@ def recognize(path: Path) -> str | None:
     except (OSError, UnicodeDecodeError):
         return None
     rows = [line for line in lines if line.strip() and not line.startswith("#")]
-    return f"a list of {len(rows)} lines, a pair each"
+    return f"a list of {len(rows)} lines, one pair per line"
 
 
 def train(path: str | Path, cache: Path, *, frames: tuple[int, int] | None = None) -> SceneSource:
-    """All pairs, each of which needs its truth; a list does not say from which frames they are."""
+    """All pairs. Each needs its true transform. A list has no frame numbers, so `frames` raises
+    ValueError."""
     from cfr_jax.data.pairs import CsvPairs, with_truth
     from cfr_jax.data.scenes import scene_source
 
@@ -56,14 +57,14 @@ def evaluate(
 
 
 def list_pairs(path: Path) -> Listing:
-    """The files of each line, of which one at least has to be there."""
+    """The two files of each line. Raises ValueError if none of all these files exists."""
     from cfr_jax.data.pairs import CsvPairs
 
     held = CsvPairs(path)
     places = [(path.parent / source, path.parent / target) for source, target in held.listed]
     if not any(file.exists() for place in places for file in place):
         raise ValueError(
-            f"{path}: of its {len(places)} pairs no file is there, as {places[0][0]}\n"
+            f"{path}: none of the files of its {len(places)} pairs exists, such as {places[0][0]}\n"
             "wanted lines of `source,target`, paths relative to the folder of the list"
         )
     return Listing(held.listed, places, "pairs of a list")
@@ -72,8 +73,8 @@ def list_pairs(path: Path) -> Listing:
 def _refuse(frames: object, path: str | Path) -> None:
     if frames:
         raise ValueError(
-            f"frames: {path} does not say from which frames its pairs are; "
-            "make a list of its own for each use"
+            f"frames: {path} does not say from which frames its pairs come; "
+            "make a separate list for each use"
         )
 
 

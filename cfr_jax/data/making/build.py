@@ -1,6 +1,6 @@
-"""Builds a corpus from meshes: each sampled, judged, held against the others, written to HDF5.
+"""Builds a corpus from meshes: samples, checks and compares them, and writes HDF5 files.
 
-What is written depends on the meshes and their names alone.
+The output depends only on the meshes and their names.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from cfr_jax.runtime.atomic import unfinished, write_atomically
 from cfr_jax.runtime.progress import Progress
 
 VALIDATION_SHARE = 0.2
-ENOUGH = 30  # to validate on: with fewer, which weights are best is a matter of chance
+ENOUGH = 30  # validation shapes; with fewer, chance decides which weights are best
 SPLITS = ("train", "val", "test")
 
 
 @dataclass
 class Report:
-    """What came of a build."""
+    """The outcome of a build."""
 
     counts: dict[str, Counter[str]] = field(default_factory=dict)  # split → category → shapes
-    left_out: dict[str, str] = field(default_factory=dict)  # name → why
-    left_out_file: Path | None = None  # which tells that, where anything was
+    left_out: dict[str, str] = field(default_factory=dict)  # name → reason
+    left_out_file: Path | None = None  # the list of these; None if nothing was left out
 
     @property
     def shapes(self) -> int:
@@ -43,7 +43,7 @@ class Report:
 
     @property
     def reasons(self) -> Counter[str]:
-        """How many shapes were left out for what; of `repeats OTHER` only the first word."""
+        """How many shapes were left out for each reason. All `repeats OTHER` count as one."""
         return Counter(
             "repeats another" if why.startswith("repeats ") else why
             for why in self.left_out.values()
@@ -51,18 +51,21 @@ class Report:
 
 
 def folder_items(folder: Path, least_faces: int = 20) -> list[Item]:
-    """Every mesh below a folder, its first folder for a category (the folder's name if none).
+    """Every mesh in a folder and its subfolders.
 
-    Raises ValueError where there is none.
+    Its category is the name of the top-level subfolder, or of the folder itself if it lies there.
+    Raises ValueError if there is no mesh.
     """
     if not folder.is_dir():
-        raise ValueError(f"no folder {folder} to take meshes from")
+        raise ValueError(f"folder: there is no folder {folder} to take meshes from")
     suffixes = by_suffix(mesh_formats())
     paths = sorted(
         path for path in folder.rglob("*") if path.suffix.lower() in suffixes and path.is_file()
     )
     if not paths:
-        raise ValueError(f"no mesh below {folder}: wanted files that end in {' '.join(suffixes)}")
+        raise ValueError(
+            f"folder: no mesh below {folder}, wanted files that end in {' '.join(suffixes)}"
+        )
     items = []
     for path in paths:
         inside = path.relative_to(folder)
@@ -81,14 +84,16 @@ def folder_items(folder: Path, least_faces: int = 20) -> list[Item]:
 
 
 def choose_unseen(categories: Sequence[str]) -> tuple[str, ...]:
-    """Half of the categories (rounded down), by a hash of their names."""
+    """Half of the categories (rounded down), chosen by a hash of their names."""
     shuffled = sorted(set(categories), key=lambda category: name_share(category, "half"))
     return tuple(sorted(shuffled[: len(shuffled) // 2]))
 
 
 def split_of(name: str, unseen: bool) -> str:
-    """Shapes of unseen categories are for the test; of the others the name's hash picks a fifth
-    for validation."""
+    """The split of a shape: "test" if its category is unseen, otherwise "train" or "val".
+
+    A hash of the name puts a fifth of the seen shapes into validation.
+    """
     if unseen:
         return "test"
     return "val" if name_share(name, "split") < VALIDATION_SHARE else "train"
@@ -102,20 +107,24 @@ def build(
     quiet: bool = False,
     categories: Sequence[str] | None = None,
 ) -> Report:
-    """Writes a corpus: `train.h5`, `val.h5`, `test.h5` into the folder `out`, or all shapes into
-    one file `out` if `unseen` is None. Beside come `shape_names.txt`, and `left_out.txt` (of one
-    file `NAME.left_out.txt`) with what was left out and why.
+    """Writes a corpus: `train.h5`, `val.h5` and `test.h5` into the folder `out`.
 
-    Labels are places among `categories`, sorted; by default those that occur. Raises ValueError
-    where no item is fit, or where items share a name.
+    If `unseen` is None, all shapes go into a single file `out`. `shape_names.txt` is written next
+    to them, and also `left_out.txt` (`NAME.left_out.txt` for a single file), which says what was
+    left out and why.
+
+    Labels are indices into the sorted `categories`, by default those that occur. Raises ValueError
+    if no item is fit, if items share a name, or if an unseen category has no mesh.
     """
     categories = sorted(set(categories or ()) | {item.category for item in items})
     unknown = sorted(set(unseen or ()) - set(categories))
     if unknown:
-        raise ValueError(f"unseen: no mesh is of the categories {unknown}; there are {categories}")
+        raise ValueError(f"unseen: no mesh is of the categories {unknown}, only of {categories}")
     repeated = [name for name, times in Counter(item.name for item in items).items() if times > 1]
     if repeated:
-        raise ValueError(f"items: {len(repeated)} names occur twice, {repeated[0]!r} for one")
+        raise ValueError(
+            f"items: {len(repeated)} names occur twice, such as {repeated[0]!r}; wanted unique ones"
+        )
 
     held_back = frozenset(unseen or ())
     work = out.with_name(f".{out.name}.work")
@@ -135,13 +144,15 @@ def build(
     repeats = drop_duplicates(shapes, [item.category not in held_back for item in kept], bar)
     for row, other in repeats.items():
         report.left_out[kept[row].name] = f"repeats {kept[other].name}"
-    # An order by hash, so that the first rows are a fair sample of the whole.
+    # Ordered by a hash, so that the first rows are a fair sample of all.
     rows = sorted(
         (row for row in range(len(kept)) if row not in repeats),
         key=lambda row: name_share(kept[row].name, "order"),
     )
     if not rows:
-        raise ValueError(f"none of {len(items)} meshes is fit for a corpus: {dict(report.reasons)}")
+        raise ValueError(
+            f"items: none of {len(items)} meshes is fit for a corpus: {dict(report.reasons)}"
+        )
 
     single = unseen is None
     folder = out.parent if single else out
@@ -154,7 +165,7 @@ def build(
             if single or split == split_of(kept[row].name, kept[row].category in held_back)
         ]  # fmt: skip
         report.counts[split] = Counter(kept[row].category for row in chosen)
-        if chosen:  # a corpus of no shapes is no corpus
+        if chosen:  # a corpus needs at least one shape
             path = out if single else out / f"{split}.h5"
             _write_corpus(path, [kept[row] for row in chosen], [shapes[row] for row in chosen],
                           categories, split)  # fmt: skip
@@ -171,12 +182,13 @@ def build(
 def _write_corpus(
     path: Path, items: Sequence[Item], shapes: Sequence[Shape], categories: list[str], split: str
 ) -> None:
-    """The layout of `modelnet40_ply_hdf5_2048`, with names, half-precision points, int8 normals."""
+    """Writes the layout of `modelnet40_ply_hdf5_2048`, plus names, with float16 points and int8
+    normals."""
     data = np.stack([shape.points for shape in shapes]).astype(np.float16)
     normal = np.round(np.stack([shape.normals for shape in shapes]) * 127).astype(np.int8)
     labels = np.array([[categories.index(item.category)] for item in items])
     chunks = (min(32, len(data)), *data.shape[1:])
-    # No times and no tracking of anything: the same corpus is the same bytes.
+    # No times and no tracking, so that the same corpus gives the same bytes.
     with (
         unfinished(path) as beside,
         h5py.File(beside, "w", libver="v110", track_order=False) as file,

@@ -1,4 +1,4 @@
-"""How one build of a corpus differs from another, shape by shape, matched by name."""
+"""Compares two builds of a corpus shape by shape, matched by name."""
 
 from __future__ import annotations
 
@@ -13,22 +13,25 @@ from scipy.spatial import cKDTree
 from cfr_jax.data.corpus import Corpus, read_corpus
 from cfr_jax.data.making.shapes import mean_nearest, name_share
 
-_MEASURED = 200  # shapes whose points are compared, picked by the hash of their names
+_MEASURED = 200  # shapes whose points are compared, chosen by a hash of their names
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Counts are of shapes. Distances are of clouds in the unit sphere, quantiles over shapes."""
+    """Counts are numbers of shapes. Distances are in units of the unit sphere's radius.
+
+    "Ours" and "here" mean the first build, "theirs" and "there" the second.
+    """
 
     ours: dict[str, int]  # split → shapes
     theirs: dict[str, int]
     common: dict[str, int]  # "our split / their split" → shapes
-    crossed: list[str]  # test here and trained on there, or the other way round
-    renamed: dict[str, list[str]]  # name → category here, category there, where they differ
+    crossed: list[str]  # in the test here but not there, or the other way around
+    renamed: dict[str, list[str]]  # name → category here and category there, if they differ
     only_ours: dict[str, int]  # category → shapes
     only_theirs: dict[str, dict[str, str]]  # category → name → why it was left out here
-    distance: dict[str, float]  # mean distance to the nearest point, quantiles
-    normals: dict[str, float]  # mean |cosine| between the normals of nearest points
+    distance: dict[str, float]  # mean distance to the nearest point, quantiles over shapes
+    normals: dict[str, float]  # mean |cosine| between normals of nearest points, quantiles
 
     def asdict(self) -> dict[str, Any]:
         return asdict(self)
@@ -48,7 +51,10 @@ class Comparison:
 
 
 def compare(ours: Path, theirs: Path) -> Comparison:
-    """Holds two folders of `train.h5`, `val.h5`, `test.h5` against each other."""
+    """Compares two folders of `train.h5`, `val.h5` and `test.h5`.
+
+    Raises ValueError if a folder has none of them.
+    """
     here, there = _read(ours), _read(theirs)
     rows = {name: (split, row) for split, corpus in here.items()
             for row, name in enumerate(corpus.names)}  # fmt: skip

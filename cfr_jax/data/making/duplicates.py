@@ -1,7 +1,7 @@
-"""Finds shapes that occur twice, perhaps mirrored or turned, in a corpus.
+"""Finds shapes that occur more than once in a corpus, possibly mirrored or rotated.
 
-Two samples of one surface lie a certain distance apart, their spacing. Two shapes are near
-duplicates if their samples lie hardly farther apart than that.
+Two samples of one surface lie a certain distance apart, the spacing. Two shapes are near duplicates
+if their samples lie hardly farther apart than that.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from cfr_jax.data.making.shapes import Shape, mean_nearest
 
 Pair = tuple[int, int]  # rows of shapes
 
-NEAR = 1.2  # times the spacing
+NEAR = 1.2  # limit, in multiples of the spacing
 NEAR_ACROSS_HALVES = 1.3
 
-# Cheap tests, passed by nearly every pair that the full one calls near duplicates. Distances to the
-# center and the extents along the principal axes do not change by turning or mirroring.
+# Cheap tests, which nearly all near duplicates of the full test pass. Distances to the center and
+# extents along the principal axes do not change under rotation or mirroring.
 _QUANTILES = np.linspace(0.02, 0.98, 25)
 _RADII_APART = 0.03  # mean over the quantiles
 _EXTENTS_APART = 0.04  # largest of the three standard deviations
-_PROBES = 128  # points of one cloud, looked up in the other
-_PROBE_SLACK = 1.35  # how much farther apart than the limit so few points may seem
-_FAR = 3.0  # times the limit; farther is not told apart, which makes looking up quick
+_PROBES = 128  # points of one cloud that are looked up in the other
+_PROBE_SLACK = 1.35  # factor on the limit, because so few points measure it roughly
+_FAR = 3.0  # distances are cut off at this multiple of the limit, which makes lookups fast
 
 _SIGNS = np.array(list(itertools.product((1.0, -1.0), repeat=3)))
 _MIRRORS = np.stack([np.diag(s) for s in ((1, 1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1))])
@@ -39,11 +39,11 @@ def drop_duplicates(
     seen: Sequence[bool],
     progress: Callable[[Sequence[Pair]], Iterable[Pair]] = lambda pairs: pairs,
 ) -> dict[int, int]:
-    """Which shapes to leave out: row → the earlier row, or the seen one, that it repeats.
+    """The shapes to leave out, as a dict: row → row of the shape that it repeats.
 
-    Of duplicates the first stays, but a shape of an unseen category never displaces a seen one, and
-    is held against those with the wider limit, so that what a network is tested on is news to it.
-    `progress` may wrap the pairs to be compared, as `tqdm` does.
+    Among duplicates, the first one stays, but seen categories come before unseen ones. An unseen
+    shape is compared with seen ones by the wider limit, so that test shapes are really new to the
+    network. `progress` may wrap the pairs to compare, as `tqdm` does.
     """
     order = sorted(range(len(shapes)), key=lambda row: (not seen[row], row))
     rank = {row: place for place, row in enumerate(order)}
@@ -77,7 +77,7 @@ def drop_duplicates(
 def _candidates(
     shapes: Sequence[Shape], axes: Sequence[Float64[np.ndarray, "3 3"]], rank: dict[int, int]
 ) -> list[Pair]:
-    """Pairs (later, earlier) by rank that are alike in what does not depend on the pose."""
+    """Pairs (later, earlier) by rank that are alike in measures that do not depend on the pose."""
     if not shapes:
         return []
     radii = np.stack(
@@ -92,12 +92,12 @@ def _candidates(
 
 
 def _principal_axes(points: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Columns, in the order of the extents along them."""
+    """The principal axes as columns, in ascending order of the extents along them."""
     return np.linalg.eigh(np.cov(points.T.astype(np.float64)))[1]
 
 
 def _alignments(
     axes: Float64[np.ndarray, "3 3"], onto: Float64[np.ndarray, "3 3"]
 ) -> Float64[np.ndarray, "8 3 3"]:
-    """Rotations and reflections that carry principal axes onto principal axes."""
+    """Rotations and reflections that map one set of principal axes onto the other."""
     return np.einsum("ik,sk,jk->sij", onto, _SIGNS, axes)

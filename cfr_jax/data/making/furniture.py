@@ -1,7 +1,7 @@
-"""SH3F, the furniture libraries of Sweet Home 3D: a zip file of OBJ models with a catalogue.
+"""SH3F, the furniture libraries of Sweet Home 3D: a zip file of OBJ models with a catalog.
 
-The catalogue, `PluginFurnitureCatalog.properties`, has lines `key#INDEX=value`; the lines of one
-INDEX describe one piece. A model is an OBJ file in the zip, or a zip in the zip with one in it.
+The catalog, `PluginFurnitureCatalog.properties`, has lines `key#INDEX=value`. The lines with one
+INDEX describe one piece. A model is an OBJ file in the zip, or a nested zip that contains one.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 from cfr_jax.io.formats.surfaces import parse_obj
 from cfr_jax.io.mesh import Mesh
 
-CATALOGUE = "PluginFurnitureCatalog.properties"
-LARGEST_MODEL = 1 << 28  # bytes; a zip may promise to unpack to any size
+CATALOG = "PluginFurnitureCatalog.properties"
+LARGEST_MODEL = 1 << 28  # bytes; a zip can unpack to any size
 
 _LINE = re.compile(r"(\w+)#(\d+)\s*[=:]\s*(.*)")
 _ESCAPE = re.compile(r"\\(u[0-9a-fA-F]{4}|.)")
@@ -26,7 +26,7 @@ _ESCAPE = re.compile(r"\\(u[0-9a-fA-F]{4}|.)")
 
 @dataclass(frozen=True)
 class Piece:
-    """One entry of a catalogue. The identifier is unique within its library."""
+    """One entry of a catalog. The identifier is unique within its library."""
 
     identifier: str
     name: str
@@ -36,20 +36,24 @@ class Piece:
     size: tuple[float, float, float]  # width, height, depth (x, y, z) in meters
 
     def scaled(self, mesh: Mesh) -> Mesh:
-        """The mesh in meters at its true size, y up, the middle of its box at the origin."""
+        """The mesh in meters at its true size, y up, with its bounding box centered at the
+        origin."""
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         scale = np.array(self.size) / np.where(high > low, high - low, 1.0)
         return Mesh((mesh.vertices - (low + high) / 2) * scale, mesh.triangles, mesh.name)
 
 
 class FurnitureLibrary:
-    """An open SH3F file; close it, or use it in a `with` statement."""
+    """An open SH3F file, to be used in a `with` statement.
+
+    Raises ValueError if the file is not a furniture library.
+    """
 
     def __init__(self, path: Path):
         self.path = path
         try:
             self._zip = zipfile.ZipFile(path)
-            text = self._zip.read(CATALOGUE).decode("latin1")
+            text = self._zip.read(CATALOG).decode("latin1")
         except (OSError, zipfile.BadZipFile, KeyError) as error:
             raise ValueError(f"{path} is not a furniture library (SH3F): {error}") from error
         self.pieces: tuple[Piece, ...] = _pieces(text, path)
@@ -75,11 +79,11 @@ def _pieces(text: str, path: Path) -> tuple[Piece, ...]:
     for index, entry in sorted(entries.items()):
         missing = [key for key in ("name", "model", "width", "depth", "height") if key not in entry]
         if missing:
-            raise ValueError(f"{path}: entry {index} of the catalogue lacks {missing}")
+            raise ValueError(f"{path}: entry {index} of the catalog lacks {missing}")
         try:
             width, depth, height = (float(entry[key]) for key in ("width", "depth", "height"))
         except ValueError:
-            raise ValueError(f"{path}: entry {index} has a size that is no number") from None
+            raise ValueError(f"{path}: entry {index} has a size that is not a number") from None
         pieces.append(
             Piece(
                 identifier=entry.get("id", f"{index}"),
@@ -115,5 +119,5 @@ def _model(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
 def _content(archive: zipfile.ZipFile, name: str) -> bytes:
     size = archive.getinfo(name).file_size
     if size > LARGEST_MODEL:
-        raise ValueError(f"{name} unpacks to {size} bytes, wanted {LARGEST_MODEL} at most")
+        raise ValueError(f"{name} unpacks to {size} bytes, wanted at most {LARGEST_MODEL}")
     return archive.read(name)

@@ -1,6 +1,6 @@
-"""Formats that corpora are made of: all surfaces of the table, and those of two games.
+"""Formats that corpora are made from: all surface formats of the table, and two formats of games.
 
-The games' files are read for corpora alone: their parsers trust what the packages hold.
+The formats of games are read only to build corpora, because their parsers trust the packages.
 """
 
 from __future__ import annotations
@@ -16,5 +16,5 @@ _GAMES = (
 
 
 def mesh_formats() -> tuple[Format, ...]:
-    """What `read_mesh` reads, in the order in which help texts list it."""
+    """The formats that `read_mesh` reads, in the order in which help texts list them."""
     return (*formats.of_surfaces(), *_GAMES)

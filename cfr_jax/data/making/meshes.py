@@ -1,6 +1,6 @@
-"""Triangle meshes from files, also of the games and simulators that open corpora come from.
+"""Reads triangle meshes, including those of the games and simulators that open corpora come from.
 
-PMD (0 A.D.) and AC3D (FlightGear) are parsed here; common formats by `cfr_jax.io`.
+PMD (0 A.D.) and AC3D (FlightGear) are parsed here, common formats by `cfr_jax.io`.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from cfr_jax.geometry import motions
 from cfr_jax.io.files import read_shape
 from cfr_jax.io.mesh import Mesh, fan_triangles
 
-_PMD_START = struct.Struct("<4sIIII")  # mark, version, size of the rest, vertices, texture sets
+_PMD_START = struct.Struct("<4sIIII")  # magic, version, size of the rest, vertices, texture sets
 _PMD_COUNT = struct.Struct("<I")
 
 
 def parse_pmd(data: bytes, name: str) -> Mesh:
-    """PMD, version 4, at rest; bones are left out.
+    """Parses PMD, version 4, in the rest pose; bones are left out.
 
-    The files wind most faces clockwise: each is turned to agree with the normals of its vertices.
+    The files wind most faces clockwise, so each face is wound to agree with the normals of its
+    vertices. Raises ValueError, beginning with `name`, for a damaged file.
     """
     if len(data) < _PMD_START.size:
-        raise ValueError(f"{name}: {len(data)} bytes are no PMD file, wanted a header of 20")
+        raise ValueError(f"{name}: got {len(data)} bytes, wanted a PMD file with a header of 20")
     mark, version, _, count, sets = _PMD_START.unpack_from(data)
     if mark != b"PSMD" or version != 4:
         raise ValueError(f"{name}: starts with {mark!r} version {version}, wanted b'PSMD' 4")
@@ -54,17 +55,21 @@ def _turned(
 ) -> Int64[np.ndarray, "t 3"]:
     a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
     wanted = normals[triangles].sum(axis=1)
-    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers are sorted out later
+    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers are removed later
         inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), wanted) < 0
     return np.where(inward[:, None], triangles[:, ::-1], triangles)
 
 
 def parse_ac3d(data: bytes, name: str) -> Mesh:
-    """AC3D: all polygons of all objects, placed by the tree. Lines, without area, are left out."""
+    """Parses AC3D: all polygons of all objects, placed by the object tree.
+
+    Lines are left out because they have no area. Raises ValueError, beginning with `name` and the
+    line, for a damaged file.
+    """
     text = data.decode("latin1")
     if not text.startswith("AC3D"):
         raise ValueError(f"{name}: starts with {text[:8]!r}, wanted 'AC3D'")
-    # Not `splitlines`, for which some letters of Latin-1 end a line.
+    # Not `splitlines`, which takes some Latin-1 characters as ends of lines.
     reader = _Ac3d(text.replace("\r\n", "\n").removesuffix("\n").split("\n"), name)
     reader.read_object(np.eye(4))
     vertices = np.concatenate(reader.vertices) if reader.vertices else np.zeros((0, 3))
@@ -78,14 +83,15 @@ class _Ac3d:
 
     def __init__(self, lines: list[str], name: str):
         self._lines, self._name = lines, name
-        self._at = 1  # behind the mark
+        self._at = 1  # after the magic line
         self._seen = 0
         self.vertices: list[np.ndarray] = []
         self.polygons: list[list[int]] = []  # corners, numbered over all objects
 
     def read_object(self, parent: Float64[np.ndarray, "4 4"]) -> None:
-        """The next OBJECT and, by recursion, its children; MATERIAL lines before it are skipped."""
-        # Exporters that drop an object forget to count one child less: the file ends instead.
+        """Reads the next OBJECT and its children. MATERIAL lines before it are skipped."""
+        # Some exporters drop an object without reducing the number of children. The file then ends
+        # early.
         if not any(self._lines[self._at :]):
             return
         while (words := self._words())[:1] != ["OBJECT"]:
@@ -96,7 +102,7 @@ class _Ac3d:
         while True:
             match self._words():
                 case ["rot", *numbers] if len(numbers) == 9:
-                    # A row of the file is where an axis of the object goes.
+                    # A row in the file is the image of an axis of the object.
                     local[:3, :3] = self._floats(numbers).reshape(3, 3).T
                 case ["loc", *numbers] if len(numbers) == 3:
                     local[:3, 3] = self._floats(numbers)
@@ -115,7 +121,7 @@ class _Ac3d:
                     return
                 case ["OBJECT", *_]:
                     self._fail("wanted 'kids' before the next OBJECT")
-                case _:  # name, texture, crease, ...: of no concern to the shape
+                case _:  # name, texture, crease, ...: they do not affect the shape
                     pass
 
     def _place(self, points: np.ndarray, motion: Float64[np.ndarray, "4 4"]) -> None:
@@ -143,7 +149,7 @@ class _Ac3d:
             self.polygons.append([first + corner for corner in corners])
 
     def _skip_text(self, length: int) -> None:
-        """Free text of `length` characters, which may hold ends of lines."""
+        """Skips free text of `length` characters, which may contain line ends."""
         while True:
             length -= len(self._line()) + 1
             if length < 0:
@@ -179,11 +185,11 @@ class _Ac3d:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """The triangles of a file, its format told by the suffix (one of `mesh_formats`).
+    """Reads the triangles of a file. Its suffix gives the format, one of `mesh_formats`.
 
-    Raises ValueError where the file cannot be read, or holds points and no faces.
+    Raises ValueError if the file cannot be read or holds points but no faces.
     """
     mesh = read_shape(path, mesh_formats())
     if not isinstance(mesh, Mesh):
-        raise ValueError(f"{path}: is a point cloud, wanted a mesh with faces")
+        raise ValueError(f"{path}: got a point cloud, wanted a mesh with faces")
     return mesh

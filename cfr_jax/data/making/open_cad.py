@@ -1,8 +1,8 @@
-"""The open corpus: shapes that games and simulators in Debian come with, in 45 categories.
+"""The open corpus: shapes from games and simulators that Debian packages, in 45 categories.
 
-Anybody can rebuild it, byte for byte, from four packages of Debian 12. The categories follow from
-the meshes' names by `open_cad_categories.txt`; 21 of them are unseen: nothing is trained on them,
-and no checkpoint is chosen by them.
+Anybody can rebuild it, byte for byte, from four packages of Debian 12. `open_cad_categories.txt`
+derives the categories from the names of the meshes. 21 of them are unseen: they are not used for
+training or for choosing checkpoints.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ _PMD = ".dae.cached.pmd"
 
 @dataclass(frozen=True)
 class Origin:
-    """A package, and the files in it that hold meshes."""
+    """A package, and which of its files hold meshes."""
 
     package: str
     version: str
-    files: str  # pattern of their paths
+    files: str  # regular expression for their paths
     credit: str
 
 
@@ -77,8 +77,9 @@ SOURCES = (
 def build_open_cad(out: Path, debs: Path | None = None, quiet: bool = False) -> Report:
     """Writes `train.h5`, `val.h5`, `test.h5`, the lists of categories, and the credits into `out`.
 
-    The packages come from `.deb` files in `debs`, or by apt if that is None. Needs 2 GB beside
-    `out` while it works. Raises ValueError where a package is not to be had.
+    The packages are `.deb` files in the folder `debs`, or are downloaded with apt if it is None.
+    The build needs 2 GB of disk space next to `out`. Raises ValueError if a package cannot be
+    found.
     """
     work = out.with_name(f".{out.name}.packages")
     out.mkdir(parents=True, exist_ok=True)
@@ -90,12 +91,12 @@ def build_open_cad(out: Path, debs: Path | None = None, quiet: bool = False) -> 
             versions[source.package] = version
             if version != source.version:
                 print(
-                    f"{source.package}: version {version}; the corpus was made of "
-                    f"{source.version}, and shapes may differ"
+                    f"{source.package}: this is version {version}; the corpus was made from "
+                    f"{source.version}, so shapes may differ"
                 )
             items += source_items(source.package, paths, stack)
         if not items:
-            raise ValueError("the packages hold no mesh of a category")
+            raise ValueError("the packages hold no mesh of any category")
         items.sort(key=lambda item: item.name)
         report = build(items, out, UNSEEN, quiet=quiet, categories=categories())
     seen = [category for category in categories() if category not in UNSEEN]
@@ -110,7 +111,7 @@ def build_open_cad(out: Path, debs: Path | None = None, quiet: bool = False) -> 
 
 
 def credits_text(versions: Mapping[str, str]) -> str:
-    """What has to stay with the corpus, made of packages of these versions."""
+    """The credits that must stay with a corpus made from packages of these versions."""
     lines = (f"- {s.credit} (Debian package `{s.package}` {versions[s.package]})" for s in SOURCES)
     return "\n".join(
         ["# Credits", "", "The point clouds are sampled from meshes of", "", *lines, ""]
@@ -120,8 +121,10 @@ def credits_text(versions: Mapping[str, str]) -> str:
 def unpack(
     source: Origin, work: Path, debs: Path | None, quiet: bool = False
 ) -> tuple[list[Path], str]:
-    """The package's mesh files, unpacked into `work` (once: a second call finds them there), and
-    its version."""
+    """Unpacks the package's mesh files into `work`; returns their paths and its version.
+
+    A second call finds the files there and does not unpack them again.
+    """
     done = work / f"{source.package}.json"
     if done.is_file():
         found = json.loads(done.read_text())
@@ -146,7 +149,7 @@ def unpack(
 
 
 def source_items(package: str, paths: list[Path], stack: ExitStack) -> Iterator[Item]:
-    """The meshes of a package that are of a category. Archives stay open as long as `stack`."""
+    """The meshes of a package that belong to a category. Archives stay open as long as `stack`."""
     for path in paths:
         if path.suffix == ".zip":
             archive = stack.enter_context(zipfile.ZipFile(path))
@@ -173,7 +176,7 @@ def _game_items(archive: zipfile.ZipFile) -> Iterator[Item]:
             continue
         if category := category_of("0ad", inside):
             name = f"0ad:{inside}"
-            # Games make small things of few faces, and they are many.
+            # Games model many small things with few faces.
             yield Item(
                 name,
                 category,
@@ -197,7 +200,7 @@ def _furniture_items(library: FurnitureLibrary, stem: str) -> Iterator[Item]:
 
 
 def category_of(source: str, path: str) -> str | None:
-    """The category of a mesh by the rules in `open_cad_categories.txt`; None: left out."""
+    """The category of a mesh by the rules in `open_cad_categories.txt`, or None to leave it out."""
     for category, pattern in _rules()[source]:
         if pattern.search(path):
             return None if category == "-" else category
@@ -205,7 +208,7 @@ def category_of(source: str, path: str) -> str | None:
 
 
 def categories() -> list[str]:
-    """All categories that a rule names, sorted: the labels of the corpus."""
+    """All categories that the rules name, sorted. Labels are indices into this list."""
     return sorted({rule[0] for rules in _rules().values() for rule in rules} - {"-"})
 
 

@@ -1,7 +1,7 @@
-"""Debian packages: fetched by apt, opened without dpkg.
+"""Debian packages: downloaded with apt, opened without dpkg.
 
-A `.deb` is an `ar` archive of a few members; `data.tar` (compressed) holds the files. Reading it
-here lets a corpus be built on machines that never heard of dpkg.
+A `.deb` is an `ar` archive with a few members. The member `data.tar` (compressed) holds the files.
+It is read here so that a corpus can be built on machines without dpkg.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from cfr_jax.runtime.atomic import unfinished
 from cfr_jax.runtime.progress import Progress
 
 _MAGIC = b"!<arch>\n"
-_HEADER = 60  # bytes: name 16, date 12, owner 6, group 6, mode 8, size 10, end mark 2
+_HEADER = 60  # bytes: name 16, date 12, owner 6, group 6, mode 8, size 10, end marker 2
 
 
 def download(package: str, folder: Path) -> Path:
-    """The package's file in `folder`, fetched by `apt-get download` unless it is there already.
+    """The package's file in `folder`, downloaded with `apt-get download` unless it is there.
 
-    Raises ValueError, with the way out, where there is no apt or apt does not know the package.
+    Raises ValueError, saying what to do, if apt is missing or cannot download the package.
     """
     if (present := find_deb(package, folder)) is not None:
         return present
     if shutil.which("apt-get") is None:
         raise ValueError(
             f"package {package}: there is no apt-get here; download {package}_*.deb from "
-            f"https://packages.debian.org/{package} and give its folder as --debs"
+            f"https://packages.debian.org/{package} and pass its folder as --debs"
         )
     beside = folder / f".{package}.part"
     beside.mkdir(parents=True, exist_ok=True)
-    # apt drops its rights for the transfer where it can; our folder may not be open to it.
+    # apt drops its privileges for the transfer if it can, and may then lack access to our folder.
     command = ["apt-get", "-o", "APT::Sandbox::User=root", "-q", "download", package]
     done = subprocess.run(command, cwd=beside, capture_output=True, text=True)
     if done.returncode or (fetched := find_deb(package, beside)) is None:
         last = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
         raise ValueError(
             f"package {package}: apt-get download failed ({last}); "
-            "`apt-get update` may help, or give the folder of the .deb files as --debs"
+            "`apt-get update` may help, or pass the folder of the .deb files as --debs"
         )
     kept = folder / fetched.name
     os.replace(fetched, kept)
@@ -55,12 +55,12 @@ def download(package: str, folder: Path) -> Path:
 
 
 def version_of(deb: Path) -> str:
-    """As the name of the file tells it, where a colon is written %3a."""
+    """The version in the file's name, in which a colon is written as %3a."""
     return unquote(deb.name.split("_")[1])
 
 
 def find_deb(package: str, folder: Path) -> Path | None:
-    """`folder/package_VERSION_ARCH.deb`, the last by name if there are several; None if none."""
+    """`folder/package_VERSION_ARCH.deb`: the last by name if there are several, None if none."""
     found = sorted(folder.glob(f"{package}_*.deb")) if folder.is_dir() else []
     return found[-1] if found else None
 
@@ -68,10 +68,10 @@ def find_deb(package: str, folder: Path) -> Path | None:
 def extract(
     deb: Path, wanted: Callable[[str], bool], into: Path, quiet: bool = False
 ) -> list[Path]:
-    """Writes the regular files of a package whose path (`usr/share/...`) is wanted below `into`.
+    """Extracts the regular files of a package whose path (`usr/share/...`) is wanted into `into`.
 
-    Returns their paths in the package's order. A file of that size that is already there is kept.
-    Raises ValueError where the file is no Debian package, or is cut off.
+    Returns their paths in the package's order. An existing file of the right size is kept. Raises
+    ValueError if the file is not a Debian package or is truncated.
     """
     written = []
     with _data_tar(deb, quiet) as tar:
@@ -94,7 +94,7 @@ def extract(
     return written
 
 
-# "r|": one pass over the stream, which ends at the tar's own end mark.
+# "r|" reads the stream in one pass, which ends at the tar's own end marker.
 _MODES: dict[str, Literal["r|", "r|gz", "r|bz2", "r|xz"]] = {
     "": "r|",
     "gz": "r|gz",
@@ -111,8 +111,8 @@ def _data_tar(deb: Path, quiet: bool) -> Iterator[tarfile.TarFile]:
             kind = name.removeprefix("data.tar").removeprefix(".")
             if kind not in _MODES:
                 raise ValueError(
-                    f"{deb}: {name} is packed in a way that Python 3.11 cannot read; repack it "
-                    "with `dpkg-deb`, or take the package of Debian 12"
+                    f"{deb}: {name} has a compression that Python 3.11 cannot read; repack it "
+                    "with `dpkg-deb`, or use the package of Debian 12"
                 )
             with Progress.wrapattr(
                 stream,
@@ -123,12 +123,12 @@ def _data_tar(deb: Path, quiet: bool) -> Iterator[tarfile.TarFile]:
                 unit="B",
                 unit_scale=True,
             ) as counted:
-                # tqdm's stubs know of the counted method only; it hands on all others
+                # tqdm's stubs only know the wrapped method, but it passes on all others
                 whole = cast(IO[bytes], counted)
                 with tarfile.open(fileobj=whole, mode=_MODES[kind]) as tar:
                     yield tar
     except (OSError, EOFError, tarfile.TarError, lzma.LZMAError, zlib.error) as error:
-        raise ValueError(f"{deb} is not a whole Debian package: {error}") from error
+        raise ValueError(f"{deb} is not a complete Debian package: {error}") from error
 
 
 def _seek_data(stream: IO[bytes], deb: Path) -> str:
@@ -142,8 +142,8 @@ def _seek_data(stream: IO[bytes], deb: Path) -> str:
             raise ValueError(f"{deb}: holds no data.tar, or is cut off")
         name = header[:16].decode("latin1").strip().rstrip("/")
         if name.startswith("data.tar"):
-            # Of a tar that was cut off, the last files would be missed without a word.
+            # If the tar were truncated, its last files would be missing without an error.
             if stream.tell() + int(size) > os.fstat(stream.fileno()).st_size:
-                raise ValueError(f"{deb} is cut off: {name} wants {int(size)} bytes")
+                raise ValueError(f"{deb} is cut off: {name} should have {int(size)} bytes")
             return name
         stream.seek(int(size) + int(size) % 2, os.SEEK_CUR)

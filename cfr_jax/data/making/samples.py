@@ -1,4 +1,4 @@
-"""Meshes sampled one after the other, and kept while the work goes on, so that an interrupted build
+"""Samples meshes one after another and saves the results on the way, so that an interrupted build
 resumes where it stopped."""
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from cfr_jax.io.mesh import Mesh
 from cfr_jax.runtime.atomic import unfinished
 from cfr_jax.runtime.progress import Progress
 
-RECIPE = "1"  # counted up when the same meshes would give another corpus
-_BLOCK = 64  # shapes sampled between two saves
+RECIPE = "1"  # incremented if the same meshes would give a different corpus
+_BLOCK = 64  # meshes sampled between two saves
 
 
 @dataclass(frozen=True)
 class Item:
     """One mesh on its way into a corpus."""
 
-    name: str  # unique; decides the random numbers and the split
+    name: str  # unique; determines the random numbers and the split
     category: str
     load: Callable[[], Mesh]
     least_faces: int = 20
@@ -35,12 +35,14 @@ class Item:
 def sampled(
     items: Sequence[Item], points: int, work: Path, quiet: bool
 ) -> Iterator[tuple[Item, Shape | str]]:
-    """Each item with its shape, or with the reason why it is none; saved below `work`, block by
-    block, where an interrupted run finds them."""
+    """Each item with its shape, or with the reason why it was left out.
+
+    Results are saved in `work`, block by block, and reused by the run after an interruption.
+    """
     plan = [RECIPE, points, [(i.name, i.least_faces, i.stamp) for i in items]]
     digest = hashlib.sha256(json.dumps(plan).encode()).hexdigest()
     folder = work / digest[:16]
-    if work.is_dir():  # samples of other meshes than these
+    if work.is_dir():  # delete samples of other meshes
         for other in work.glob("[0-9a-f]" * 16):
             if other != folder:
                 shutil.rmtree(other)

@@ -11,17 +11,17 @@ from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.making.shapes import name_share
 from cfr_jax.runtime.atomic import write_atomically
 
-_INCH = 1.15  # of one shape
+_INCH = 1.15  # inches per shape
 _LABEL = 1.8  # inches for the category's name
 _DPI = 100
-_TURN = np.radians(35.0)  # about the vertical axis, then forward: most shapes stand upright, y up
+_TURN = np.radians(35.0)  # about the vertical axis, then tilted: most shapes are upright with y up
 _TILT = np.radians(20.0)
 
 
 def write_sheet(path: Path, corpus: Corpus, columns: int = 8) -> None:
     """Writes a PNG with up to `columns` shapes of each category, colored by their normals.
 
-    Raises ModuleNotFoundError without matplotlib (the `viz` extra).
+    Raises ModuleNotFoundError if matplotlib (the `viz` extra) is missing.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg

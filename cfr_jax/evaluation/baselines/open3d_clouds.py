@@ -1,4 +1,4 @@
-"""Our clouds as Open3D's, with what the classical methods need besides points."""
+"""Converts clouds to Open3D, with the normals and features that classical methods need."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ def open3d_cloud(
 ) -> Any:
     """An `open3d.geometry.PointCloud`, thinned to `voxel` if that is given.
 
-    With a `normal_radius` it has normals: its own, or else estimated before the thinning from at
-    most 30 points within the radius, facing the centroid, so that two views agree on the sign.
+    With a `normal_radius` the result has normals. If the cloud has none, they are estimated before
+    the thinning, from at most 30 points within the radius. They face the centroid, so that two
+    views agree on the sign.
     """
     o3d = require("open3d")
     made = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))

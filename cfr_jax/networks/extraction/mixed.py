@@ -1,12 +1,13 @@
 """The MLP and its maximum with activations in bfloat16: half the memory traffic on accelerators.
 
-On a GPU the MLP waits for memory, not for arithmetic. So here a whole cloud goes by at once, each
-layer's values are stored once, in two bytes, and nothing is made twice. Products take bfloat16 in
-and sum in float32; norms, their statistics, and the gradients of the weights are float32.
+On a GPU the MLP is limited by memory, not by arithmetic. So this form processes a whole cloud at
+once, stores the values of each layer once, in two bytes each, and recomputes nothing. Products take
+bfloat16 inputs and accumulate in float32. The norms, their statistics, and the gradients of the
+weights are float32.
 
-The gradient is that of `backward`, with two differences. Ties at the maximum are frequent, as
-bfloat16 has eight bits: they share the gradient. And sums that follow from the moments of the
-forward pass are not summed again.
+The gradient is that of `backward`, with two differences. Ties at the maximum are frequent, because
+bfloat16 has eight bits of precision; tied values share the gradient. And sums that follow from the
+moments of the forward pass are not computed again.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _Kept = tuple[
     tuple[Array, Array, Array, Array], tuple[Norm, Norm, Norm],
     Array, Array, Array, Array, Array, Array,
 ]  # fmt: skip
-"""Means and a covariance, norms, what was pooled, and the layers' inputs and outputs."""
+"""Means and a covariance, norms, the pooled values, and the layers' inputs and outputs."""
 
 
 def pooled_mixed(
@@ -38,8 +39,11 @@ def pooled_mixed(
     groups: int,
     stored: DTypeLike = jnp.bfloat16,
 ) -> Float[Array, "n d"]:
-    """`extraction.pooled_features` of the points that are `valid` (1, or 0), before the others are
-    set to zero. Differentiates by its own rule, once. `stored` is what activations are kept in."""
+    """`extraction.pooled_features`, except that features of invalid points are not yet zero.
+
+    `valid` is 1 for valid points and 0 for the others. `stored` is the type of the activations. The
+    gradient has a rule of its own and can be taken once.
+    """
     return _pooled(layers, raw, valid, groups, stored)
 
 
@@ -58,7 +62,7 @@ def _forward(
     spread = ((covariance @ one.kernel) * one.kernel).sum(0)
     norm_one = norm_of(mean @ one.kernel + one.bias, spread, groups)
     kernel_one, bias_one = fold(one, norm_one)
-    # a channel of ones carries the bias; with it there are eight, as matrix units want
+    # a channel of ones carries the bias, and makes eight channels, which suits matrix units
     x = jnp.pad(raw, ((0, 0), (0, 0), (0, 1)), constant_values=1).astype(stored)
     y_one = jax.nn.relu(x @ jnp.vstack([kernel_one, bias_one]).astype(stored))
     y_one = lax.optimization_barrier(y_one)
@@ -89,7 +93,8 @@ def _backward(
     count = jnp.maximum(jnp.sum(valid) * raw.shape[1], 1)
     weight = valid[:, None, None]
 
-    # Third layer: the maximum of each point has a gradient, all others what the norm takes out.
+    # Third layer: the maximum of each point receives the gradient; all other values receive only
+    # what the norm takes out.
     gradient = jnp.where(normal * three.scale + three.shift > 0, gradient, 0) * valid[:, None]
     shift_three, scale_three = gradient.sum(0), (gradient * normal).sum(0)
     flat, tilt = projections(three, shift_three, scale_three, count, groups)
@@ -120,7 +125,7 @@ def _backward(
     kernel_two = _over_rows(y_one, d_z)
     d_y = d_z @ two.kernel.astype(stored).T
 
-    # First layer: its normalized output is linear in the raw channels, and so is all that remains.
+    # First layer: its normalized output is linear in the raw channels, so the rest is linear too.
     d_n = jnp.where(y_one > 0, d_y, 0)
     outer = _over_rows(x, d_n)
     outer, shift_one = outer[:-1], outer[-1]
@@ -145,8 +150,11 @@ _pooled.defvjp(_forward, _backward)
 
 
 def _moments_of_raw(raw: Array, valid: Array, count: Array) -> tuple[Array, Array]:
-    """Mean and covariance of the raw channels. Summed, not multiplied: a product of so few columns
-    leaves a GPU's units empty, and would be rounded there."""
+    """Mean and covariance of the raw channels.
+
+    Computed as sums, not as a matrix product: a product of so few columns leaves most of a GPU's
+    matrix units idle, and would be rounded there.
+    """
     weight = valid[:, None, None]
     mean = _sum(raw * weight) / count
     centered = raw - mean
@@ -162,7 +170,7 @@ def _norm(
     z: Array, valid: Array, count: Array, bias: Array, groups: int, sign: Array | int = 1
 ) -> tuple[Array, Norm]:
     """Mean of each channel of z sign + bias, and the norm."""
-    values = z.astype(bias.dtype)  # on its way into the sums
+    values = z.astype(bias.dtype)  # fused into the sums
     total, square = (
         _sum(each * valid[:, None, None]) / count for each in (values, values * values)
     )
@@ -171,7 +179,7 @@ def _norm(
 
 
 def _sum(values: Array) -> Array:
-    """Over points and neighbors: over the neighbors first, next to each other in memory."""
+    """The sum over points and neighbors; neighbors first, as they are adjacent in memory."""
     return with_layout_constraint(values, Layout((0, 1, 2))).sum((0, 1))
 
 
@@ -187,6 +195,6 @@ def _normalizing(norm: Norm, bias: Array) -> tuple[Array, Array]:
 
 
 def _over_rows(left: Array, right: Array) -> Array:
-    """left' right over all rows, summed in float32."""
+    """left' right over all rows, accumulated in float32."""
     left, right = (rows.reshape(-1, rows.shape[-1]) for rows in (left, right))
     return jnp.matmul(left.T, right, preferred_element_type=jnp.float32)

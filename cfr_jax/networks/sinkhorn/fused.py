@@ -1,12 +1,13 @@
 """The block inside a kernel (Pallas, Triton): features in, sums out, no n x m array anywhere.
 
-A program has some rows and goes over all columns, tile by tile: the product of the features, the
-exponential, and at once the sums that are wanted. Column sums are the same kernel, the clouds
-exchanged. So a pass makes the block twice. On paper that pays only where the block does not fit a
-device: an H200 reads 12,000^2 stored numbers in 0.13 ms and makes them by float32 products in
-0.5 ms or more (2 n m d = 28 GFLOP, 60 TFLOP/s), so `match` chooses it nowhere by itself.
+Each program of the kernel has some rows and goes over all columns, tile by tile: it computes the
+product of the features and the exponential, and adds to the sums at once. Column sums use the same
+kernel with the clouds exchanged, so a pass computes the block twice. On paper that pays off only if
+the block does not fit in the device's memory: an H200 reads 12,000^2 stored numbers in 0.13 ms, and
+computes them by float32 products in 0.5 ms or more (2 n m d = 28 GFLOP, 60 TFLOP/s). So `match`
+never chooses this form by itself.
 
-Elsewhere than on GPUs the kernels are interpreted, which is slow and gives the same answers. JAX
+On anything but a GPU the kernels are interpreted, which is slow and gives the same answers. JAX
 0.11 warns that it will drop the Triton backend of Pallas.
 """
 
@@ -26,13 +27,13 @@ from jaxtyping import Array, Bool, Float
 from cfr_jax.networks.sinkhorn.affinity import Affinity, log_affinity
 from cfr_jax.networks.sinkhorn.scaling import Spent
 
-_Ref = Any  # an array as a kernel sees it; Pallas has no public class for it
+_Ref = Any  # an array inside a kernel; Pallas has no public class for it
 
-_CHUNK = 32  # channels of a product; what a kernel holds has powers of two for sizes
+_CHUNK = 32  # channels of one product; the sizes of arrays in a kernel must be powers of two
 
 
 class Fused:
-    """`scaling.Block` of which nothing is stored; `rows` by `rows` tiles."""
+    """A `scaling.Block` that is never stored; tiles are `rows` by `rows`."""
 
     def __init__(
         self,
@@ -44,7 +45,7 @@ class Fused:
     ):
         self.affinity: Affinity = affinity
         self.size: int = rows
-        # what a log affinity is lessened by: all of it, where masked
+        # subtracted from the log affinities; infinite where masked
         self.less: list[Array] = [
             jnp.where(mask, 0, jnp.inf).astype(affinity.beta.dtype) for mask in masks
         ]
@@ -75,8 +76,11 @@ class Fused:
         sums: int,
         more: int = 0,
     ) -> tuple[Array, ...]:
-        """A kernel over the rows, or with the clouds exchanged; `others`: an array of the rows and
-        one of the columns, if any. Arrays (rows, sums), and (rows, more)."""
+        """Runs a kernel over the rows; with `flip`, the clouds are exchanged.
+
+        `others` holds an array for the rows and one for the columns, if there are any. Returns
+        arrays (rows, sums) and, if `more` is not 0, (rows, more).
+        """
         clouds = [self.affinity.source, self.affinity.target]
         here, there = reversed(clouds) if flip else clouds
         less = self.less[::-1] if flip else self.less
@@ -114,7 +118,7 @@ def _call(
     if of_columns is not None:
         given.append(_padded(of_columns, 0 if wide else 1, size))
         specs.append(_whole(given[-1]))
-    # a kernel's arrays are as wide as powers of two; sums that are not, one after the other
+    # widths in a kernel must be powers of two; `_sums` writes its sums one at a time instead
     widths = [here.shape[1], more] if wide else [sums]
     shapes = [(here.shape[0], width) for width in widths]
 
@@ -148,7 +152,8 @@ def _whole(part: Array) -> pl.BlockSpec:
 def _logs(
     annealing: _Ref, here: _Ref, less_here: _Ref, there: _Ref, less_there: _Ref, tile: Array
 ) -> tuple[Array, Array, pl.Slice | slice]:
-    """Log affinities, lessened, of this program's rows and a tile of columns; |f - g|^2; which."""
+    """For this program's rows and one tile of columns: the log affinities less their offsets,
+    |f - g|^2, and the slice of those columns."""
     size = less_here.shape[0]
     columns = pl.ds(tile * size, size)
     products = (

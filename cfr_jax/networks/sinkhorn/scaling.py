@@ -1,8 +1,8 @@
-"""The match and its gradient by products with the block, whoever has it: stored, or made on the go.
+"""The match and its gradient by products with the block, which may be stored or recomputed.
 
-Forward, a pass is u <- 1 / (m v + 1), v <- 1 / (m' u + 1). The gradient goes the same way backwards
-(`streamed` says how); in the end the gradient of log m_ij is m_ij times a product of two thin
-matrices, and the block spends it on the features.
+Forward, a pass is u <- 1 / (m v + 1), v <- 1 / (m' u + 1). The gradient takes the same steps
+backward (see `streamed`). In the end the gradient with respect to log m_ij is m_ij times a product
+of two thin matrices, and `Block.spend` carries it on to the features.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ _HIGHEST = lax.Precision.HIGHEST
 
 
 class Spent(NamedTuple):
-    """Sums of share_ij over a block: times g_j, times f_i, times alpha - |f_i - g_j|^2, alone."""
+    """Sums of share_ij over a block.
+
+    In the order of the fields: times g_j, times f_i, times alpha - |f_i - g_j|^2, and as it is.
+    """
 
     source: Float[Array, "n d"]
     target: Float[Array, "m d"]
@@ -40,7 +43,7 @@ class Spent(NamedTuple):
 
 @runtime_checkable
 class Block(Protocol):
-    """m_ij = exp(log affinity_ij - shift_i), zero where masked, for its products' sake."""
+    """m_ij = exp(log affinity_ij - shift_i), zero where masked; used only through its products."""
 
     shift: Float[Array, " n"]
     """max(0, the largest log affinity of the row), so that nothing overflows."""
@@ -61,7 +64,7 @@ def forward(block: Block, points: Float[Array, "m 3"], passes: int) -> tuple[Mat
     slack = jnp.exp(-block.shift)
     v, every = jnp.ones(points.shape[0], points.dtype), []
     for _ in range(passes):
-        # the floor is reached only where a whole row has vanished: it then stays without partner
+        # the floor is reached only if a whole row underflows: that point stays without a partner
         u = 1 / jnp.maximum(block.rows(v[:, None])[:, 0] + slack, tiny)
         found = block.columns(u[:, None])[:, 0]
         every.append((u, v))
@@ -74,7 +77,7 @@ def forward(block: Block, points: Float[Array, "m 3"], passes: int) -> tuple[Mat
 def backward(
     block: Block, affinity: Affinity, points: Float[Array, "m 3"], trace: Trace, gradient: Match
 ) -> tuple[Affinity, Float[Array, "m 3"]]:
-    """The gradient of what was matched, and of the points."""
+    """The gradients with respect to the affinity and the points."""
     u, v_before, v, _, sums = trace
     of_sums = gradient_of_sums(gradient, sums)
     pull = of_sums * u[-1][:, None]
@@ -98,7 +101,7 @@ def backward(
 
 
 class Stored:
-    """The block as it is."""
+    """A block that is stored in memory."""
 
     def __init__(
         self,

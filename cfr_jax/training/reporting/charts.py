@@ -1,4 +1,4 @@
-"""What is drawn of a training: the page and TensorBoard both draw the numbers named here."""
+"""The charts of a training: the page and TensorBoard both draw the numbers named here."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _VALIDATION = ("rotation_mean", "rotation_median", "translation_mean", "recall_5
 
 @dataclass(frozen=True)
 class Curve:
-    """How one number went over the steps."""
+    """One number over the steps."""
 
     name: str
     steps: Sequence[int]
@@ -22,7 +22,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Chart:
-    """Curves of one unit that belong together."""
+    """Curves that belong together, in one unit."""
 
     title: str
     unit: str
@@ -30,9 +30,9 @@ class Chart:
 
 
 def scalars(line: dict[str, Any]) -> dict[str, float]:
-    """The numbers of a line of the journal by tag, as in "training/loss".
+    """The numbers in a line of the journal by tag, such as "training/loss".
 
-    What is known of every iteration has a number behind, from 1: "training/beta/1".
+    Values per iteration are numbered from 1: "training/beta/1".
     """
     validation = line.get("validation", {})
     found = {f"training/{name}": line[name] for name in _TRAINING if name in line}
@@ -43,7 +43,7 @@ def scalars(line: dict[str, Any]) -> dict[str, float]:
 
 
 def charts(lines: Sequence[dict[str, Any]]) -> list[Chart]:
-    """The charts of a whole journal; those of which nothing was measured are left out."""
+    """The charts of a whole journal; charts without any measurement are left out."""
     measured = [(line["step"], scalars(line)) for line in lines]
     tags = {tag for _, found in measured for tag in found}
     count = sum(tag.startswith("training/beta/") for tag in tags)
