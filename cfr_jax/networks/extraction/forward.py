@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from cfr_jax.networks.extraction import whole
 from cfr_jax.networks.extraction.tiles import Limits, cut, cut_rows, each, kept_of, scan, tiling_of
 from cfr_jax.networks.layers import Layer, Norm, fold, norm_of
 
@@ -39,8 +40,11 @@ def forward(
     n = raw.shape[0]
     widths = [layer.bias.size for layer in layers]
 
+    at_once = limits.at_once > 1 and tiling_of(n, raw.shape[1], limits).number == 1
+
     def of_points() -> tuple[Array, Kept]:
-        pooled, kept = _forward(layers, raw, valid, groups, limits)
+        run = _of_whole if at_once else _of_tiles
+        pooled, kept = run(layers, raw, valid, groups, limits)
         second = kept.second.reshape(-1, widths[1])[:rows_kept]
         more = rows_kept - len(second)  # the tiles of another platform may hold more padding
         return pooled, kept._replace(second=jnp.pad(second, ((0, more), (0, 0))))
@@ -60,7 +64,14 @@ def forward(
     return lax.cond(some, of_points, of_none)
 
 
-def _forward(
+def _of_whole(
+    layers: tuple[Layer, Layer, Layer], raw: Array, valid: Array, groups: int, _: Limits
+) -> tuple[Array, Kept]:
+    pooled, values = whole.forward(layers, raw, valid, groups=groups, stored=raw.dtype)
+    return pooled, Kept(values.norms, values.normal, values.z_two)
+
+
+def _of_tiles(
     layers: tuple[Layer, Layer, Layer], raw: Array, valid: Array, groups: int, limits: Limits
 ) -> tuple[Array, Kept]:
     one, two, three = layers

@@ -16,20 +16,14 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import lax
 from jax.experimental.layout import Layout, with_layout_constraint
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from cfr_jax.networks.layers import Layer, Norm, fold, norm_of, projections
+from cfr_jax.networks.extraction.whole import Values, forward
+from cfr_jax.networks.layers import Layer, Norm, projections
 
 _Layers = tuple[Layer, Layer, Layer]
-_Kept = tuple[
-    tuple[Array, Array, Array, Array], tuple[Norm, Norm, Norm],
-    Array, Array, Array, Array, Array, Array,
-]  # fmt: skip
-"""Means and a covariance, norms, the pooled values, and the layers' inputs and outputs."""
 
 
 def pooled_mixed(
@@ -54,41 +48,17 @@ def _pooled(layers: _Layers, raw: Array, valid: Array, groups: int, stored: DTyp
 
 def _forward(
     layers: _Layers, raw: Array, valid: Array, groups: int, stored: DTypeLike
-) -> tuple[Array, tuple[_Layers, Array, Array, _Kept]]:
-    one, two, three = layers
-    count = jnp.maximum(jnp.sum(valid) * raw.shape[1], 1)
-
-    mean, covariance = _moments_of_raw(raw, valid, count)
-    spread = ((covariance @ one.kernel) * one.kernel).sum(0)
-    norm_one = norm_of(mean @ one.kernel + one.bias, spread, groups)
-    kernel_one, bias_one = fold(one, norm_one)
-    # a channel of ones carries the bias, and makes eight channels, which suits matrix units
-    x = jnp.pad(raw, ((0, 0), (0, 0), (0, 1)), constant_values=1).astype(stored)
-    y_one = jax.nn.relu(x @ jnp.vstack([kernel_one, bias_one]).astype(stored))
-    y_one = lax.optimization_barrier(y_one)
-
-    z_two = y_one @ two.kernel.astype(stored)
-    mean_two, norm_two = _norm(z_two, valid, count, two.bias, groups)
-    gain, level = _affine(two, norm_two)
-    y_two = jax.nn.relu(z_two.astype(raw.dtype) * gain + level).astype(stored)
-
-    # under a negative scale the smallest value becomes the largest
-    sign = jnp.where(three.scale >= 0, 1, -1).astype(raw.dtype)
-    z_three = y_two @ (three.kernel * sign).astype(stored)
-    high = z_three.max(1).astype(raw.dtype)
-    mean_three, norm_three = _norm(z_three, valid, count, three.bias, groups, sign)
-    normal = (high * sign + three.bias - norm_three.mean) * norm_three.rate
-    pooled = jax.nn.relu(normal * three.scale + three.shift)
-    norms = (norm_one, norm_two, norm_three)
-    kept = (mean, covariance, mean_two, mean_three), norms, normal, x, y_one, z_two, y_two, z_three
-    return pooled, (layers, raw, valid, kept)
+) -> tuple[Array, tuple[_Layers, Array, Array, Values]]:
+    pooled, values = forward(layers, raw, valid, groups=groups, stored=stored)
+    return pooled, (layers, raw, valid, values)
 
 
 def _backward(
-    groups: int, stored: DTypeLike, residuals: tuple[_Layers, Array, Array, _Kept], gradient: Array
+    groups: int, stored: DTypeLike, residuals: tuple[_Layers, Array, Array, Values], gradient: Array
 ) -> tuple[_Layers, Array, Array]:
-    (one, two, three), raw, valid, kept = residuals
-    (mean, covariance, mean_two, mean_three), norms, normal, x, y_one, z_two, y_two, z_three = kept
+    (one, two, three), raw, valid, values = residuals
+    means, covariance, norms, normal, x, y_one, z_two, y_two, z_three = values
+    mean, mean_two, mean_three = means
     norm_one, norm_two, norm_three = norms
     count = jnp.maximum(jnp.sum(valid) * raw.shape[1], 1)
     weight = valid[:, None, None]
@@ -147,35 +117,6 @@ def _backward(
 
 
 _pooled.defvjp(_forward, _backward)
-
-
-def _moments_of_raw(raw: Array, valid: Array, count: Array) -> tuple[Array, Array]:
-    """Mean and covariance of the raw channels.
-
-    Computed as sums, not as a matrix product: a product of so few columns leaves most of a GPU's
-    matrix units idle, and would be rounded there.
-    """
-    weight = valid[:, None, None]
-    mean = _sum(raw * weight) / count
-    centered = raw - mean
-    channels = raw.shape[-1]
-    row, column = np.triu_indices(channels)
-    sums = _sum(centered[..., row] * centered[..., column] * weight) / count
-    place = np.zeros((channels, channels), np.int32)
-    place[row, column] = place[column, row] = np.arange(len(row))
-    return mean, sums[place]
-
-
-def _norm(
-    z: Array, valid: Array, count: Array, bias: Array, groups: int, sign: Array | int = 1
-) -> tuple[Array, Norm]:
-    """Mean of each channel of z sign + bias, and the norm."""
-    values = z.astype(bias.dtype)  # fused into the sums
-    total, square = (
-        _sum(each * valid[:, None, None]) / count for each in (values, values * values)
-    )
-    mean = total * sign + bias
-    return mean, norm_of(mean, square - total * total, groups)
 
 
 def _sum(values: Array) -> Array:
