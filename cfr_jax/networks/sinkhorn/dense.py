@@ -36,9 +36,14 @@ def match_dense(
     slack = jnp.exp(-shift)
     tiny = jnp.finfo(block.dtype).tiny
     v = jnp.ones(block.shape[1], block.dtype)
-    for _ in range(passes):
+    # With the barrier, an accelerator makes the block and the sums of its rows in one kernel.
+    # Without it, XLA stores the logarithms as well, and computes the block from them repeatedly.
+    block, found = lax.optimization_barrier((block, jnp.matmul(block, v, precision=_HIGHEST)))
+    for i in range(passes):
+        if i:
+            found = jnp.matmul(block, v, precision=_HIGHEST)
         # the floor is reached only if a whole row underflows: that point stays without a partner
-        u = 1 / jnp.maximum(jnp.matmul(block, v, precision=_HIGHEST) + slack, tiny)
+        u = 1 / jnp.maximum(found + slack, tiny)
         found = jnp.matmul(u, block, precision=_HIGHEST)
         v = 1 / (found + 1)
     sums = jnp.matmul(block, v[:, None] * with_ones(points), precision=_HIGHEST)
