@@ -30,8 +30,8 @@ class Settings:
     ppf: PairFeature = "dot"
     match: Form = "auto"
     """How correspondences are found. "dense" stores the N x M affinities, "streamed" recomputes
-    them whenever they are needed, and "fused" does so inside a GPU kernel. "auto" streams clouds
-    that are large for the platform. "log space" is RPM-Net's form."""
+    them whenever they are needed. "auto" streams clouds that are large for the platform. "log
+    space" is RPM-Net's form."""
     detach_motion: bool = False
     """Stop gradients at the motion between iterations, as in the paper's training."""
     activations: Activations = "float32"

@@ -8,19 +8,20 @@ asked for, sums, sums of squares and the maximum, is found in one reading.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.experimental.layout import Layout, with_layout_constraint
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from cfr_jax.networks.layers import Layer, Norm, fold, norm_of
 
-_WRITTEN_OUT = 64  # neighbors; a longer sum would make a program that is long to compile
+_HIGHEST = lax.Precision.HIGHEST  # for what becomes a variance
+_SLICES = 32  # all of 64 would take a second longer to compile
 
 
 class Values(NamedTuple):
@@ -54,20 +55,23 @@ def forward(
     """The pooled features; `stored` is what activations are kept in. What nobody looks at of the
     values is never stored."""
     one, two, three = layers
-    raw = with_layout_constraint(raw, Layout((2, 0, 1)))
+    n, k, _ = raw.shape
+    planes = jnp.moveaxis(raw, -1, 0)
     count = jnp.maximum(jnp.sum(valid) * raw.shape[1], 1)
 
-    mean, covariance = _moments_of_raw(raw, valid, count)
+    mean, covariance = _moments_of_raw(planes, valid, count)
     spread = ((covariance @ one.kernel) * one.kernel).sum(0)
     norm_one = norm_of(mean @ one.kernel + one.bias, spread, groups)
     kernel_one, bias_one = fold(one, norm_one)
-    x = jnp.pad(raw, ((0, 0), (0, 0), (0, 1)), constant_values=1).astype(stored)
+    x = jnp.pad(planes, ((0, 1), (0, 0), (0, 0)), constant_values=1).astype(stored)
+    x = x.reshape(len(x), -1).T
     y_one = jax.nn.relu(x @ jnp.vstack([kernel_one, bias_one]).astype(stored))
-    # otherwise the product would be made again wherever it is read
-    y_one = lax.optimization_barrier(y_one)
+    # the barriers: XLA would make what is multiplied again wherever it is read, and would copy both
+    # clouds of a pair into one array, as they are multiplied by the same kernel
+    y_one, kernel_two = lax.optimization_barrier((y_one, two.kernel.astype(stored)))
 
-    z_two = y_one @ two.kernel.astype(stored)
-    sums, squares, _ = _over_neighbors(z_two, raw.dtype)
+    z_two = y_one @ kernel_two
+    sums, squares, _ = _over_neighbors(z_two, k, raw.dtype)
     mean_two, norm_two = _norm(sums, squares, valid, count, two.bias, groups)
     gain = two.scale * norm_two.rate
     level = (two.bias - norm_two.mean) * gain + two.shift
@@ -75,9 +79,11 @@ def forward(
 
     # under a negative scale the smallest value becomes the largest
     sign = jnp.where(three.scale >= 0, 1, -1).astype(raw.dtype)
-    z_three = y_two @ (three.kernel * sign).astype(stored)
-    sums, squares, high = _over_neighbors(z_three, raw.dtype)
-    mean_three, norm_three = _norm(sums * sign, squares, valid, count, three.bias, groups)
+    kernel_three = (three.kernel * sign).astype(stored)
+    y_two, kernel_three = lax.optimization_barrier((y_two, kernel_three))
+    z_three = y_two @ kernel_three
+    sums, squares, high = _over_neighbors(z_three, k, raw.dtype)
+    mean_three, norm_three = _norm(sums, squares, valid, count, three.bias, groups, sign)
     normal = (high * sign + three.bias - norm_three.mean) * norm_three.rate
     pooled = jax.nn.relu(normal * three.scale + three.shift)
     values = Values(
@@ -85,23 +91,18 @@ def forward(
         covariance,
         (norm_one, norm_two, norm_three),
         normal,
-        x,
-        y_one,
-        z_two,
-        y_two,
-        z_three,
+        *(rows.reshape(n, k, -1) for rows in (x, y_one, z_two, y_two, z_three)),
     )
     return pooled, values
 
 
-def _moments_of_raw(raw: Array, valid: Array, count: Array) -> tuple[Array, Array]:
+def _moments_of_raw(planes: Array, valid: Array, count: Array) -> tuple[Array, Array]:
     """Mean and covariance of the raw channels. Summed, not multiplied: a product of so few columns
     leaves a GPU's units empty, and would be rounded there."""
 
-    def mean_of(planes: Array) -> Array:
-        return jnp.sum(planes * valid[:, None], (1, 2)) / count
+    def mean_of(values: Array) -> Array:
+        return jnp.sum(values * valid[:, None], (1, 2)) / count
 
-    planes = jnp.moveaxis(raw, -1, 0)
     mean = mean_of(planes)
     centered = planes - mean[:, None, None]
     row, column = np.triu_indices(len(planes))
@@ -111,27 +112,37 @@ def _moments_of_raw(raw: Array, valid: Array, count: Array) -> tuple[Array, Arra
     return mean, sums[place]
 
 
-def _over_neighbors(z: Array, dtype: DTypeLike) -> tuple[Array, Array, Array]:
+def _over_neighbors(z: Array, k: int, dtype: DTypeLike) -> tuple[Array, Array, Array]:
     """Sums, sums of squares and the largest value over each point's neighbors, (n, d) each.
 
-    Written out as sums of slices, which XLA fuses into one kernel that reads z once; of three
-    reductions of columns it makes three. The barrier keeps it from looking through z's shape.
+    XLA would read z for each of them. So a part of the way is written out as sums of slices, which
+    become one kernel that reads z once; what is left to reduce is small. The barriers keep XLA
+    from looking through the shapes; and as they are flat, it cannot turn z over, either.
     """
-    z = lax.optimization_barrier(with_layout_constraint(z, Layout((0, 1, 2)))).astype(dtype)
-    k = z.shape[1]
-    if k > _WRITTEN_OUT:
-        return z.sum(1), (z * z).sum(1), z.max(1)
-    first, *rest = (z[:, i] for i in range(k))
+    width, count = z.shape[1], math.gcd(k, _SLICES)
+    z = lax.optimization_barrier(z.reshape(-1)).astype(dtype)
+    slices = z.reshape(-1, count, k // count, width)
+    first, *rest = (slices[:, i] for i in range(count))
     sums, squares, high = first, first * first, first
     for each in rest:
         sums, squares, high = sums + each, squares + each * each, jnp.maximum(high, each)
-    return lax.optimization_barrier((sums, squares, high))
+    found = lax.optimization_barrier([part.reshape(-1) for part in (sums, squares, high)])
+    sums, squares, high = (part.reshape(-1, k // count, width) for part in found)
+    return sums.sum(1), squares.sum(1), high.max(1)
 
 
 def _norm(
-    sums: Array, squares: Array, valid: Array, count: Array, bias: Array, groups: int
+    sums: Array,
+    squares: Array,
+    valid: Array,
+    count: Array,
+    bias: Array,
+    groups: int,
+    sign: Array | int = 1,
 ) -> tuple[Array, Norm]:
-    """Mean of each channel with its bias, and the norm, from each point's sums."""
-    total, square = (jnp.sum(part * valid[:, None], 0) / count for part in (sums, squares))
-    mean = total + bias
+    """Mean of each channel of z sign + bias, and the norm, from each point's sums of z."""
+    total, square = (
+        jnp.matmul(valid, part, precision=_HIGHEST) / count for part in (sums, squares)
+    )
+    mean = total * sign + bias
     return mean, norm_of(mean, square - total * total, groups)

@@ -4,7 +4,7 @@ The affinities m = exp(log affinity) get an extra row and column of ones, the sl
 without a partner. The slack row and column are never normalized themselves. One pass divides every
 real row by its sum, then every real column by its sum, slack included. Several forms give the same
 numbers: `dense` stores the (n, m) block, `streamed` recomputes it in blocks of rows whenever it is
-needed, `fused` does so inside a GPU kernel, and `log_space` is the published form, to compare with.
+needed, and `log_space` is the published form, to compare with.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from cfr_jax.networks.sinkhorn.streamed import rows_of
 
 __all__ = ["FORMS", "Affinity", "Form", "Match", "form_for", "match"]
 
-Form = Literal["auto", "dense", "streamed", "fused", "log space"]
+Form = Literal["auto", "dense", "streamed", "log space"]
 Platform = Literal["cpu", "accelerator"]
 
 # The most entries that are stored: 128 MiB of float32 on a CPU, 2 GiB on an accelerator. Each
@@ -31,7 +31,6 @@ Platform = Literal["cpu", "accelerator"]
 _STORED: dict[Platform, int] = {"cpu": 1 << 25, "accelerator": 1 << 29}
 # Entries of one streamed block of rows: 16 MiB and 256 MiB.
 _STREAMED: dict[Platform, int] = {"cpu": 1 << 22, "accelerator": 1 << 26}
-_TILE = 64  # rows and columns of a kernel's tile
 
 
 def match(
@@ -68,10 +67,6 @@ def _match_streamed(affinity: Affinity, points: Array, **rest: Any) -> Match:
     return _by_hand(affinity, points, [_streamed(affinity, each) for each in _STREAMED], **rest)
 
 
-def _match_fused(affinity: Affinity, points: Array, **rest: Any) -> Match:
-    return _by_hand(affinity, points, 2 * [Way("fused", _TILE)], **rest)
-
-
 def _by_hand(affinity: Affinity, points: Array, ways: list[Way], **rest: Any) -> Match:
     return match_by_hand(affinity, points, on_cpu=ways[0], elsewhere=ways[1], **rest)
 
@@ -95,6 +90,5 @@ def _match_by_size(affinity: Affinity, points: Array, **rest: Any) -> Match:
 FORMS: dict[Form, Callable[..., Match]] = {
     "dense": match_dense,
     "streamed": _match_streamed,
-    "fused": _match_fused,
     "log space": match_in_log_space,
 }

@@ -24,10 +24,10 @@ _Masks = tuple[Array, Array]
 class Way(NamedTuple):
     """How a platform computes the match."""
 
-    kind: Literal["stored", "streamed", "fused"]
-    """Stored in memory, streamed in blocks of whole rows, or computed inside a kernel."""
+    kind: Literal["stored", "streamed"]
+    """Stored in memory, or streamed in blocks of whole rows."""
     rows: int
-    """Rows of a streamed block or of a kernel's tile; not used if stored."""
+    """Rows of a streamed block; not used if stored."""
 
 
 def match_by_hand(
@@ -64,7 +64,7 @@ def _forward(
     ) -> tuple[Match, scaling.Trace]:
         if way.kind == "streamed":
             return streamed.forward(affinity, points, masks, passes=passes, rows=way.rows)
-        return scaling.forward(_block(way, affinity, masks), points, passes)
+        return scaling.forward(scaling.Stored(affinity, masks), points, passes)
 
     found, trace = _by_platform(run, ways, affinity, points, masks)
     return found, (affinity, points, masks, trace)
@@ -88,24 +88,13 @@ def _backward(
             return streamed.backward(
                 affinity, points, masks, trace, gradient, passes=passes, rows=way.rows
             )
-        block = _block(way, affinity, masks, trace.shift)
+        block = scaling.Stored(affinity, masks, trace.shift)
         return scaling.backward(block, affinity, points, trace, gradient)
 
     return *_by_platform(run, ways, *residuals, gradient), None
 
 
 _match.defvjp(_forward, _backward)
-
-
-def _block(
-    way: Way, affinity: Affinity, masks: _Masks, shift: Array | None = None
-) -> scaling.Block:
-    if way.kind == "fused":
-        # imported here: Pallas takes a quarter of a second to import, and no other form needs it
-        from cfr_jax.networks.sinkhorn import fused
-
-        return fused.Fused(affinity, masks, shift, rows=way.rows)
-    return scaling.Stored(affinity, masks, shift)
 
 
 def _by_platform(run: Callable[..., Any], ways: tuple[Way, Way], *arguments: Any) -> Any:

@@ -1,13 +1,13 @@
-"""The match and its gradient by products with the block, which may be stored or recomputed.
+"""The match and its gradient by products with a block that is stored in memory.
 
 Forward, a pass is u <- 1 / (m v + 1), v <- 1 / (m' u + 1). The gradient takes the same steps
 backward (see `streamed`). In the end the gradient with respect to log m_ij is m_ij times a product
-of two thin matrices, and `Block.spend` carries it on to the features.
+of two thin matrices, and `Stored.spend` carries it on to the features.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -41,24 +41,7 @@ class Spent(NamedTuple):
     alpha: Float[Array, ""]
 
 
-@runtime_checkable
-class Block(Protocol):
-    """m_ij = exp(log affinity_ij - shift_i), zero where masked; used only through its products."""
-
-    shift: Float[Array, " n"]
-    """max(0, the largest log affinity of the row), so that nothing overflows."""
-
-    def rows(self, right: Float[Array, "m c"]) -> Float[Array, "n c"]:
-        """m right."""
-
-    def columns(self, left: Float[Array, "n c"]) -> Float[Array, "m c"]:
-        """m' left."""
-
-    def spend(self, left: Float[Array, "n r"], right: Float[Array, "m r"]) -> Spent:
-        """The sums of share_ij = m_ij left_i . right_j."""
-
-
-def forward(block: Block, points: Float[Array, "m 3"], passes: int) -> tuple[Match, Trace]:
+def forward(block: Stored, points: Float[Array, "m 3"], passes: int) -> tuple[Match, Trace]:
     """The match, and what its gradient needs."""
     tiny = jnp.finfo(points.dtype).tiny
     slack = jnp.exp(-block.shift)
@@ -75,7 +58,7 @@ def forward(block: Block, points: Float[Array, "m 3"], passes: int) -> tuple[Mat
 
 
 def backward(
-    block: Block, affinity: Affinity, points: Float[Array, "m 3"], trace: Trace, gradient: Match
+    block: Stored, affinity: Affinity, points: Float[Array, "m 3"], trace: Trace, gradient: Match
 ) -> tuple[Affinity, Float[Array, "m 3"]]:
     """The gradients with respect to the affinity and the points."""
     u, v_before, v, _, sums = trace
@@ -101,7 +84,10 @@ def backward(
 
 
 class Stored:
-    """A block that is stored in memory."""
+    """m_ij = exp(log affinity_ij - shift_i), zero where masked, and its products.
+
+    The shift of a row is max(0, its largest log affinity), so that nothing overflows.
+    """
 
     def __init__(
         self,
@@ -116,12 +102,15 @@ class Stored:
         self.block: Array = jnp.exp(log_values - self.shift[:, None])
 
     def rows(self, right: Float[Array, "m c"]) -> Float[Array, "n c"]:
+        """m right."""
         return jnp.matmul(self.block, right, precision=_HIGHEST)
 
     def columns(self, left: Float[Array, "n c"]) -> Float[Array, "m c"]:
+        """m' left."""
         return jnp.matmul(self.block.T, left, precision=_HIGHEST)
 
     def spend(self, left: Float[Array, "n r"], right: Float[Array, "m r"]) -> Spent:
+        """The sums of share_ij = m_ij left_i . right_j."""
         share = self.block * jnp.matmul(left, right.T, precision=_HIGHEST)
         return Spent(
             jnp.matmul(share, self.affinity.target, precision=_HIGHEST),
