@@ -55,8 +55,8 @@ def forward(
     """The pooled features; `stored` is what activations are kept in. What nobody looks at of the
     values is never stored."""
     one, two, three = layers
-    n, k, _ = raw.shape
     planes = jnp.moveaxis(raw, -1, 0)
+    planes = lax.optimization_barrier(planes.reshape(-1)).reshape(planes.shape)  # in this order
     count = jnp.maximum(jnp.sum(valid) * raw.shape[1], 1)
 
     mean, covariance = _moments_of_raw(planes, valid, count)
@@ -64,14 +64,14 @@ def forward(
     norm_one = norm_of(mean @ one.kernel + one.bias, spread, groups)
     kernel_one, bias_one = fold(one, norm_one)
     x = jnp.pad(planes, ((0, 1), (0, 0), (0, 0)), constant_values=1).astype(stored)
-    x = x.reshape(len(x), -1).T
+    x = jnp.moveaxis(x, 0, -1)
     y_one = jax.nn.relu(x @ jnp.vstack([kernel_one, bias_one]).astype(stored))
     # the barriers: XLA would make what is multiplied again wherever it is read, and would copy both
     # clouds of a pair into one array, as they are multiplied by the same kernel
     y_one, kernel_two = lax.optimization_barrier((y_one, two.kernel.astype(stored)))
 
     z_two = y_one @ kernel_two
-    sums, squares, _ = _over_neighbors(z_two, k, raw.dtype)
+    sums, squares, _ = _over_neighbors(z_two, raw.dtype)
     mean_two, norm_two = _norm(sums, squares, valid, count, two.bias, groups)
     gain = two.scale * norm_two.rate
     level = (two.bias - norm_two.mean) * gain + two.shift
@@ -82,7 +82,7 @@ def forward(
     kernel_three = (three.kernel * sign).astype(stored)
     y_two, kernel_three = lax.optimization_barrier((y_two, kernel_three))
     z_three = y_two @ kernel_three
-    sums, squares, high = _over_neighbors(z_three, k, raw.dtype)
+    sums, squares, high = _over_neighbors(z_three, raw.dtype)
     mean_three, norm_three = _norm(sums, squares, valid, count, three.bias, groups, sign)
     normal = (high * sign + three.bias - norm_three.mean) * norm_three.rate
     pooled = jax.nn.relu(normal * three.scale + three.shift)
@@ -91,7 +91,11 @@ def forward(
         covariance,
         (norm_one, norm_two, norm_three),
         normal,
-        *(rows.reshape(n, k, -1) for rows in (x, y_one, z_two, y_two, z_three)),
+        x,
+        y_one,
+        z_two,
+        y_two,
+        z_three,
     )
     return pooled, values
 
@@ -112,14 +116,15 @@ def _moments_of_raw(planes: Array, valid: Array, count: Array) -> tuple[Array, A
     return mean, sums[place]
 
 
-def _over_neighbors(z: Array, k: int, dtype: DTypeLike) -> tuple[Array, Array, Array]:
+def _over_neighbors(z: Array, dtype: DTypeLike) -> tuple[Array, Array, Array]:
     """Sums, sums of squares and the largest value over each point's neighbors, (n, d) each.
 
     XLA would read z for each of them. So a part of the way is written out as sums of slices, which
     become one kernel that reads z once; what is left to reduce is small. The barriers keep XLA
     from looking through the shapes; and as they are flat, it cannot turn z over, either.
     """
-    width, count = z.shape[1], math.gcd(k, _SLICES)
+    _, k, width = z.shape
+    count = math.gcd(k, _SLICES)
     z = lax.optimization_barrier(z.reshape(-1)).astype(dtype)
     slices = z.reshape(-1, count, k // count, width)
     first, *rest = (slices[:, i] for i in range(count))
