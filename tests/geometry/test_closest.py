@@ -68,6 +68,6 @@ def test_an_accelerator_needs_no_loop():
     shapes = [jax.ShapeDtypeStruct((n, 3), jnp.float32) for n in (4000, 5000)]
     program = jax.jit(closest).trace(*shapes)
 
-    for platform in ("cuda", "tpu", "cpu"):
+    for platform in ("cuda", "rocm", "tpu", "cpu"):
         text = program.lower(lowering_platforms=(platform,)).as_text()
         assert ("stablehlo.while" in text) == (platform == "cpu")

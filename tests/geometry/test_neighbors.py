@@ -177,7 +177,7 @@ def test_balls_hold_their_first_points_by_index(name, k, search):
         np.testing.assert_array_equal(found[row], [*wanted, *[row] * (k - len(wanted))])
 
 
-@pytest.mark.parametrize(("platform", "most"), [("cuda", 0), ("tpu", 0), ("cpu", 2)])
+@pytest.mark.parametrize(("platform", "most"), [("cuda", 0), ("rocm", 0), ("tpu", 0), ("cpu", 2)])
 def test_an_accelerator_searches_without_a_loop(platform, most):
     points = jax.ShapeDtypeStruct((4000, 3), jnp.float32)
 

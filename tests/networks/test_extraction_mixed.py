@@ -159,7 +159,7 @@ def shapes_in(line):
     ]
 
 
-@pytest.mark.parametrize("platform", ["cuda", "tpu"])
+@pytest.mark.parametrize("platform", ["cuda", "rocm", "tpu"])
 def test_its_gradient_lowers_for_accelerators(layers, raw, platform):
     def loss(layers, raw):
         return jnp.sum(pooled_features(layers, raw, groups=GROUPS, activations="bfloat16"))

@@ -243,7 +243,7 @@ def test_an_accelerator_stores_what_a_cpu_streams(n, stored):
 
     for function in (total, jax.grad(total, (0, 1))):
         traced = jax.jit(function).trace(given, points)
-        for platform in ("cpu", "cuda", "tpu"):
+        for platform in ("cpu", "cuda", "rocm", "tpu"):
             text = traced.lower(lowering_platforms=(platform,)).as_text()
             assert ("stablehlo.while" in text) == (platform == "cpu" or not stored)
             assert (f"tensor<{n}x{n}xf32>" in text) == (platform != "cpu" and stored)
