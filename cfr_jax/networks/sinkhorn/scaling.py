@@ -46,9 +46,10 @@ def forward(block: Stored, points: Float[Array, "m 3"], passes: int) -> tuple[Ma
     tiny = jnp.finfo(points.dtype).tiny
     slack = jnp.exp(-block.shift)
     v, every = jnp.ones(points.shape[0], points.dtype), []
-    for _ in range(passes):
+    for i in range(passes):
+        found = block.rows(v[:, None])[:, 0] if i else block.sums
         # the floor is reached only if a whole row underflows: that point stays without a partner
-        u = 1 / jnp.maximum(block.rows(v[:, None])[:, 0] + slack, tiny)
+        u = 1 / jnp.maximum(found + slack, tiny)
         found = block.columns(u[:, None])[:, 0]
         every.append((u, v))
         v = 1 / (found + 1)
@@ -99,7 +100,12 @@ class Stored:
         self.square: Array = squared_distances(affinity.source, affinity.target)
         log_values = masked(log_affinity(self.square, affinity.beta, affinity.alpha), *masks)
         self.shift: Array = jnp.maximum(jnp.max(log_values, axis=1), 0) if shift is None else shift
-        self.block: Array = jnp.exp(log_values - self.shift[:, None])
+        block = jnp.exp(log_values - self.shift[:, None])
+        sums = jnp.matmul(block, jnp.ones(block.shape[1], block.dtype), precision=_HIGHEST)
+        # the barrier is that of `dense`: XLA makes both in one kernel, and stores no logarithms
+        self.block: Array
+        self.sums: Array  # of the rows
+        self.block, self.sums = lax.optimization_barrier((block, sums))
 
     def rows(self, right: Float[Array, "m c"]) -> Float[Array, "n c"]:
         """m right."""
