@@ -105,7 +105,7 @@ def answer(case: Case) -> Alignment:
     fitness = float(found.quality.fitness)
     clues = confidence.named(found.clues)
     probability = doubts.probability(calibration_of(case.params), clues, fitness)
-    neighbors = min(plan.source.neighbors.shape[1], plan.target.neighbors.shape[1])
+    neighbors = min(plan.source.neighbor_count, plan.target.neighbor_count)
     return Alignment(
         transform=transform,
         transforms=frames.to_caller(np.asarray(found.registration.transforms)),

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cfr_jax.alignment import solving
+from cfr_jax.alignment.align import on_host
 from cfr_jax.alignment.answers import Alignment, answer
 from cfr_jax.alignment.case import Case, Found
 from cfr_jax.alignment.planning import SETTINGS, Plan
@@ -34,10 +35,13 @@ _KEPT = 32  # encoded targets, about 2 MB each
 class Device:
     """Runs programs on the accelerator, and remembers the targets that it encoded last."""
 
-    def __init__(self, params: Params, refine: Refinement | None, second_look: bool, size: int):
-        self._params, self._refine = params, refine
+    def __init__(
+        self, params: Params, refinements: tuple[Refinement, ...], second_look: bool, size: int
+    ):
+        self._params, self._refinements = params, refinements
         self.size: int = size
-        self._second_look = refine is not None and second_look
+        self._refine = refinements[0] if refinements else None
+        self._second_look = self._refine is not None and second_look
         self._encoded = Memo(_KEPT)
 
     def solve(self, plans: Sequence[Plan]) -> list[Alignment]:
@@ -48,7 +52,11 @@ class Device:
         began = time.perf_counter()
         filled = [*plans, *[plans[-1]] * (self.size - len(plans))]
         targets, waited = zip(*(self._encode(plan.target) for plan in filled), strict=True)
-        arguments = (self._params, [solving.on_device(plan.source) for plan in filled], targets)
+        arguments = (
+            self._params,
+            list(solving.on_device(*(plan.source for plan in filled))),
+            targets,
+        )
         started = time.perf_counter()
         program = programs.compiled(solve_many, *arguments, refine=self._refine)
         compiled = time.perf_counter()
@@ -66,15 +74,17 @@ class Device:
         ]
 
     def _answer(self, plan: Plan, found: Found, seconds: dict[str, float]) -> Alignment:
-        """The answer, after a second look if it is in doubt.
+        """The answer, after a second look if it is in doubt, and the refinements on the host.
 
-        Such pairs are few, so they are solved one by one.
+        Both take one pair at a time.
         """
         case = Case(self._params, plan, found, seconds=dict(seconds))
+        began = time.perf_counter()
         if self._second_look:
-            began = time.perf_counter()
             case = look_again(case, refine=self._refine)
-            case.seconds["total"] += time.perf_counter() - began
+        for step in on_host(case.plan, self._refinements):
+            case = step(case)
+        case.seconds["total"] += time.perf_counter() - began
         return answer(case)
 
     def _encode(self, target: UnitCloud) -> tuple[Encoded, float]:
@@ -83,7 +93,7 @@ class Device:
 
         def make() -> Encoded:
             nonlocal compiling
-            arguments = (self._params, solving.on_device(target))
+            arguments = (self._params, *solving.on_device(target))
             started = time.perf_counter()
             program = programs.compiled(encode_target, *arguments)
             compiling = time.perf_counter() - started
@@ -95,7 +105,7 @@ class Device:
 def signature(plan: Plan) -> Signature:
     """A key that is equal for plans that one compiled program can solve."""
     return tuple(
-        (cloud.points.shape, cloud.neighbors.shape, cloud.normals is None)
+        (cloud.points.shape, cloud.neighbor_count, cloud.normals is None)
         for cloud in (plan.source, plan.target)
     )
 

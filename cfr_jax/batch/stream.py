@@ -9,17 +9,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-
-from cfr_jax.alignment.align import checked_params
+from cfr_jax.alignment.align import checked_params, chosen_refinements
 from cfr_jax.alignment.answers import Alignment
 from cfr_jax.alignment.planning import DEFAULT_BUDGET, Plan, planned, whole_number
+from cfr_jax.alignment.solving import on_accelerator
 from cfr_jax.batch.device import Device, Signature, signature
 from cfr_jax.batch.memo import Memo
 from cfr_jax.geometry import units
 from cfr_jax.io import PointCloud, as_point_cloud
 from cfr_jax.networks.record import Params
-from cfr_jax.refine import find
 
 # More pairs per call keep an accelerator busy, but do not fit in a CPU's caches.
 ON_CPU, ON_ACCELERATOR = 1, 16
@@ -45,6 +43,7 @@ def align_many(
     params: Params | None = None,
     refine: bool | str = True,
     max_points: int | None = None,
+    all_points: bool = True,
     second_look: bool = True,
     seed: int = 0,
     batch: int | None = None,
@@ -63,8 +62,9 @@ def align_many(
     file or with the same points, is read and encoded once while it is among the last ones used.
 
     With `ordered`, outcomes come in the order of the pairs. Otherwise they come as soon as they are
-    done. The answers equal those of `align` up to float32 rounding. A `second_look` runs pair by
-    pair. `refine` may name any refinement that JAX can trace. If a pair cannot be read or has no
+    done. The answers equal those of `align` up to float32 rounding. A `second_look` and the last
+    refinement, on `all_points`, run pair by pair. `refine` may name any refinement that JAX can
+    trace. If a pair cannot be read or has no
     answer, its outcome has an `error`, and the others continue. Do not change an array before its
     outcome has come.
 
@@ -75,27 +75,27 @@ def align_many(
         budget = whole_number("max_points", max_points, least=3)
     seed = whole_number("seed", seed, least=0)
     if batch is None:
-        batch = ON_CPU if jax.default_backend() == "cpu" else ON_ACCELERATOR
+        batch = ON_ACCELERATOR if on_accelerator() else ON_CPU
     if workers is None:
         workers = min(4, os.cpu_count() or 1)
     weights = checked_params(params)
-    refinement = find(refine)
-    if refinement is not None and not refinement.traceable:
+    refinements = chosen_refinements(refine, all_points=all_points)
+    if refinements and not refinements[0].traceable:
         raise ValueError(
             f"refine: got {refine!r}, which runs on the host; wanted True, False or one that JAX "
             "can trace. `align` takes any, pair by pair"
         )
-    device = Device(weights, refinement, second_look, whole_number("batch", batch, least=1))
+    device = Device(weights, refinements, second_look, whole_number("batch", batch, least=1))
     workers = whole_number("workers", workers, least=1)
-    done = _done(_Planner(budget, seed), pairs, device, workers)
+    done = _done(_Planner(budget, seed, len(refinements) > 1), pairs, device, workers)
     return _in_order(done) if ordered else done
 
 
 class _Planner:
     """Prepares pairs, on many threads at once; repeated targets are prepared only once."""
 
-    def __init__(self, budget: int, seed: int):
-        self._budget, self._seed = budget, seed
+    def __init__(self, budget: int, seed: int, whole: bool):
+        self._budget, self._seed, self._whole = budget, seed, whole
         self._clouds, self._units = Memo(_TARGET_CLOUDS), Memo(_TARGET_UNITS)
 
     def __call__(self, pair: Any) -> Plan:
@@ -122,6 +122,8 @@ class _Planner:
             to_unit=to_unit,
             max_points=self._budget,
             seed=self._seed,
+            whole=self._whole,
+            search=not on_accelerator(),
         )
         if plan.starts is not None:
             raise ValueError(

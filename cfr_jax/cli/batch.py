@@ -91,6 +91,11 @@ def add_parser(commands: Commands) -> None:
         "--max-points", metavar="N", type=numbers.positive, help="most points of each cloud"
     )
     how.add_argument(
+        "--thinned",
+        action="store_true",
+        help="do not refine large clouds on all of their points at the end",
+    )
+    how.add_argument(
         "--seed",
         metavar="S",
         type=numbers.not_negative,
@@ -147,6 +152,7 @@ def run(args: argparse.Namespace) -> int:
         "refine": not args.no_refine,
         "second_look": not args.no_second_look,
         "max_points": args.max_points,
+        "all_points": not args.thinned,
         "seed": args.seed,
     }
     kept = out.with_suffix(".jsonl")
@@ -183,6 +189,7 @@ def _register(left: list[Job], journal: Journal, params: Params, args: argparse.
         refine=not args.no_refine,
         second_look=not args.no_second_look,
         max_points=args.max_points,
+        all_points=not args.thinned,
         seed=args.seed,
         batch=args.batch_size,
         workers=args.workers,

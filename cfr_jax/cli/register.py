@@ -14,6 +14,7 @@ from cfr_jax import refine
 from cfr_jax.cli.shared import numbers, outputs
 from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.io import formats
+from cfr_jax.runtime import optional
 
 UNTRUSTED = 3
 
@@ -130,10 +131,12 @@ def add_parser(commands: Commands) -> None:
         help="most points of each cloud that the network sees; more are slower (default: chosen)",
     )
     how.add_argument(
-        "--all-points",
+        "--thinned",
         action="store_true",
-        help="refine further on every point of large clouds, after the thinned ones",
+        help="stop at the points that the network sees; otherwise, larger clouds are refined on "
+        "all of their points at the end",
     )
+    how.add_argument("--all-points", action="store_true", help=argparse.SUPPRESS)  # what it was
     how.add_argument(
         "--no-second-look",
         action="store_true",
@@ -176,6 +179,8 @@ def _files() -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Reads, registers and writes; what can be checked is checked before JAX is imported."""
+    if args.all_points:
+        raise ValueError("--all-points: all points are used without it; --thinned turns that off")
     to_stdout = args.json == Path("-")
     _check_outputs(args, to_stdout)
 
@@ -201,7 +206,7 @@ def run(args: argparse.Namespace) -> int:
         refine=False if args.no_refine else args.refine,
         initial=initial,
         max_points=args.max_points,
-        all_points=args.all_points,
+        all_points=not args.thinned,
         second_look=not args.no_second_look,
         seed=args.seed,
     )
@@ -238,9 +243,7 @@ def _check_outputs(args: argparse.Namespace, to_stdout: bool) -> None:
     chosen = refine.find(args.refine)
     library = None if chosen is None else chosen.library
     if library is not None and importlib.util.find_spec(library) is None:
-        raise ValueError(
-            f'--refine {args.refine} needs {library}: pip install "cfr_jax[baselines]"'
-        )
+        raise ValueError(f"--refine {args.refine} needs {library}: {optional.way_out(library)}")
     if args.png is not None:
         outputs.check_library("--png", args.png)
 

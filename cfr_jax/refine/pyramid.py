@@ -73,7 +73,7 @@ def refine(source: HostSurface, target: HostSurface, initial: Float[np.ndarray, 
     before, after = (_score(*level, motion, cut) for motion in (initial, transform))
     improved = after <= before
     transform = transform if improved else initial
-    return Fit(transform, improved, settled, steps, *_measure(*level, transform))
+    return Fit(transform, improved, settled, steps)
 
 
 def _level(surface: HostSurface, budget: int) -> Level:
@@ -165,11 +165,3 @@ def _score(source: Level, target: Level, transform: np.ndarray, cut: float) -> f
     """`generalized_icp.scores` of one motion, by the tree."""
     distance, _ = _pairs(source, target, transform, cut)
     return float(np.mean(1 - (1 - np.minimum(distance / cut, 1) ** 2) ** 3))
-
-
-def _measure(source: Level, target: Level, transform: np.ndarray) -> tuple[float, float]:
-    """Fitness and inlier error."""
-    distance, _ = _pairs(source, target, transform, CUT)
-    near = distance[np.isfinite(distance)]
-    rmse = float(np.sqrt(np.mean(near**2))) if len(near) else 0.0
-    return len(near) / len(distance), rmse

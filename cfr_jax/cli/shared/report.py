@@ -48,7 +48,7 @@ def register(
     refine: bool | str = True,
     initial: Initial = None,
     max_points: int | None = None,
-    all_points: bool = False,
+    all_points: bool = True,
     second_look: bool = True,
     seed: int = 0,
 ) -> Result:

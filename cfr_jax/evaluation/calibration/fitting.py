@@ -141,7 +141,7 @@ def _row(params: Params, trial: Trial) -> list[float]:
     )
     # `register` by itself runs one cascade and takes no second look
     plan = planned(trial.source, trial.target, initial=found.initial if trial.searched else None)
-    arguments = solving.on_device(plan.source), solving.on_device(plan.target)
+    arguments = solving.on_device(plan.source, plan.target)
     alone = _register(uncalibrated(params), *arguments)
     of_network = [float(getattr(alone.clues, name)) for name in confidence.OF_NETWORK]
     right = [False, False]
