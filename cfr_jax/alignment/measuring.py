@@ -6,8 +6,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Float
 
-from cfr_jax.geometry import motions
-from cfr_jax.refine.surfaces import HostSurface
+from cfr_jax.refine.surfaces import HostSurface, closest
 
 
 @struct.dataclass
@@ -25,8 +24,7 @@ def measure(
 ) -> Measured:
     """Fitness, inlier error, overlap and moments of `transform` (source onto target), in float64,
     as `quality.measure` defines them: points within `distance` are inliers."""
-    moved = motions.apply(transform, source.points)
-    rows, away = target.tree.closest(moved)
+    rows, away = closest(source, target, transform)
     inlier = away <= distance
     near = away[inlier]
     partners = target.points[rows[inlier]]

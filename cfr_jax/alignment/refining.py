@@ -40,7 +40,7 @@ def refine_every_point(case: Case, *, refine: Refinement) -> Case:
     the network saw: it depends on how dense a cloud is.
     """
     began = time.perf_counter()
-    found, surfaces = case.solved(), _every(case.plan)
+    found, surfaces = case.solved(), every_point(case.plan)
     fit = refine(*surfaces, np.asarray(found.transform, np.float64))
     transform = np.asarray(fit.transform, np.float64)
     measured = measuring.measure(*surfaces, transform, solving.DISTANCE)
@@ -61,7 +61,7 @@ def _used(unit: UnitCloud) -> HostSurface:
     return HostSurface(unit.points[unit.mask].astype(np.float64), normals)
 
 
-def _every(plan: Plan) -> tuple[HostSurface, HostSurface]:
+def every_point(plan: Plan) -> tuple[HostSurface, HostSurface]:
     """All points of both clouds, where the unit clouds of the plan lie."""
     assert plan.whole is not None, "planned with `whole`"
     frames = plan.frames

@@ -11,6 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from cfr_jax.geometry import motions
 from cfr_jax.geometry.trees import Tree
 
 T = TypeVar("T")
@@ -47,6 +48,15 @@ class HostSurface:
         if key not in self._made:
             self._made[key] = make()
         return self._made[key]
+
+
+def closest(
+    source: HostSurface, target: HostSurface, transform: Float[np.ndarray, "4 4"]
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """The row of the target's point closest to each point of the moved source, and the distance.
+    Asked for again, the answer is still there."""
+    key = "closest", target, transform.tobytes()
+    return source.once(key, lambda: target.tree.closest(motions.apply(transform, source.points)))
 
 
 @struct.dataclass

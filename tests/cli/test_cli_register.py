@@ -376,3 +376,20 @@ def test_in_a_process_of_its_own_it_keeps_what_it_compiled_and_says_nothing_else
     assert any((tmp_path / "cache").iterdir())
     assert second["seconds"]["compile"] < first["seconds"]["compile"]
     assert all(line.startswith("cfr register: warning") for line in runs[1].stderr.splitlines())
+
+
+@pytest.mark.parametrize(("options", "wanted"), [((), True), (("--thinned",), False)])
+def test_all_points_are_used_unless_told_otherwise(pair, answering, options, wanted):
+    calls = answering()
+
+    assert main(["register", *pair, *options]) == 0
+
+    assert calls[0]["all_points"] is wanted
+
+
+def test_the_old_option_is_refused_and_the_new_one_named(pair, answering, capsys):
+    answering()
+
+    assert main(["register", *pair, "--all-points"]) == 2
+
+    assert "--all-points: all points are used without it; --thinned" in capsys.readouterr().err
