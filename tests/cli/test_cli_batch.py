@@ -160,7 +160,7 @@ def test_all_points_are_used_unless_told_otherwise_and_the_journal_knows(
     assert run(listed) == 0 and run(listed, "--thinned", out="thinned.csv") == 0
     assert asked == [True, False]
     assert run(listed, "--thinned") == 2
-    assert "was begun with all_points True, not False" in capsys.readouterr().err
+    assert "all_points True, not False" in capsys.readouterr().err
 
 
 def test_strict_tells_that_a_pair_failed(tmp_path):
