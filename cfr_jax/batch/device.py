@@ -26,7 +26,7 @@ from cfr_jax.networks.record import Params
 from cfr_jax.refine import Refinement
 from cfr_jax.runtime import programs
 
-Signature: TypeAlias = tuple[tuple[tuple[int, ...], tuple[int, ...], bool], ...]
+Signature: TypeAlias = tuple[tuple[tuple[int, ...], int, bool], ...]
 """Of source and target: the shapes of points and neighbors, and whether there are no normals."""
 
 _KEPT = 32  # encoded targets, about 2 MB each

@@ -1,9 +1,10 @@
-"""Refinement on all points of large clouds, from the answer of thinned ones.
+"""Refinement on all points of large clouds, from an answer found on thinned ones.
 
-The usual pyramid of voxel grids: the network and the first refinement see a thousand points, then
-come a grid eight times as full and the clouds themselves, each with a narrower cut. The steps are
-those of `generalized_icp`. The closest points come from a KD-tree on the host, and the sums are
-taken over some thousand pairs at a time, so memory grows with the clouds and nothing else.
+It is the usual pyramid of voxel grids. The network and the first refinement see a thousand points.
+Then follow a grid with eight times as many points and the clouds themselves, each with a narrower
+cut. The steps are those of `generalized_icp`. The closest points come from a KD-tree on the host,
+and the sums are taken over a few thousand pairs at a time, so that memory grows with the clouds
+only.
 """
 
 from __future__ import annotations
