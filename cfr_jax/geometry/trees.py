@@ -17,7 +17,7 @@ class Tree:
     threads share the queries, and each query is answered alone."""
 
     def __init__(self, points: Float[np.ndarray, "m 3"]):
-        self.points = np.ascontiguousarray(points, np.float64)
+        self.points: Float[np.ndarray, "m 3"] = np.ascontiguousarray(points, np.float64)
 
     @functools.cached_property
     def of_library(self) -> Any:
