@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64, Int64, Real
 
 from cfr_jax.io.cloud import PointCloud, checked_points, usable_normals
 
+if TYPE_CHECKING:
+    from cfr_jax.io.table import Table
+
 DEFAULT_SAMPLES = 10_000
+# All corners one after the other, where each polygon starts among them, and how many it has.
+Polygons = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,12 +26,14 @@ class Mesh:
     triangles: Int64[np.ndarray, "t 3"]
     name: str
     normals: Real[np.ndarray, "v 3"] | None = None
+    notes: tuple[str, ...] = ()
+    table: Table | None = None
 
     def points(self, samples: int | None, seed: int) -> PointCloud:
         """The surface as `samples` points, 10,000 if None; the bare vertices if 0."""
         if samples == 0:
             normals = None if self.normals is None else usable_normals(self.normals)
-            return PointCloud(self.vertices, normals, self.name)
+            return PointCloud(self.vertices, normals, self.name, notes=self.notes, table=self.table)
         if len(self.triangles) == 0:
             raise ValueError(
                 f"is a mesh without faces ({len(self.vertices)} vertices), wanted at least one "
@@ -45,7 +53,7 @@ class Mesh:
             )
         generator = np.random.default_rng(seed)
         points, normals = sample_triangles(vertices[self.triangles], count, generator)
-        return PointCloud(points, normals, self.name)
+        return PointCloud(points, normals, self.name, notes=self.notes, table=self.table)
 
 
 def sample_triangles(

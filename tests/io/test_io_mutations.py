@@ -69,9 +69,10 @@ def mutate(data: bytes, generator: random.Random) -> bytes:
 
 def run_cases(cases: int, seed: int) -> dict:
     """Reads that many damaged files, and tells what was wrong about how that went."""
-    from cfr_jax.io import CloudFileError, read
+    from cfr_jax.io import CloudFileError, CloudWarning, read
 
     warnings.simplefilter("error")
+    warnings.simplefilter("ignore", CloudWarning)  # a damaged name of a column may bring it about
     failures: list[str] = []
     refused = 0
     slowest, largest = 0.0, 0

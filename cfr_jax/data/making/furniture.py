@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cfr_jax.io.formats.surfaces import parse_obj
+from cfr_jax.io.formats.meshes.surfaces import parse_obj
 from cfr_jax.io.mesh import Mesh
 
 CATALOG = "PluginFurnitureCatalog.properties"
@@ -66,7 +66,10 @@ class FurnitureLibrary:
 
     def mesh(self, piece: Piece) -> Mesh:
         """The model of a piece, in the units of its file (see `Piece.scaled`)."""
-        return parse_obj(_model(self._zip, piece.model, self.path), piece.identifier)
+        shape = parse_obj(_model(self._zip, piece.model, self.path), piece.identifier)
+        if not isinstance(shape, Mesh):
+            raise ValueError(f"{piece.identifier}: has no faces, wanted a mesh")
+        return shape
 
 
 def _pieces(text: str, path: Path) -> tuple[Piece, ...]:

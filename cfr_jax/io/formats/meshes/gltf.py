@@ -12,15 +12,17 @@ from urllib.parse import unquote
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from cfr_jax.io.cloud import CloudFileError, as_float64
+from cfr_jax.io.cloud import CloudFileError, PointCloud, as_float64
 from cfr_jax.io.files import contents
 from cfr_jax.io.mesh import Mesh
+from cfr_jax.io.table import cloud_of_filled
 
 T = TypeVar("T")
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}
-_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
+_SURFACES = (_TRIANGLES, _STRIP, _FAN)
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 # A mesh may be placed many times; this bounds the rows that a small file can unfold to.
 _ALWAYS_ALLOWED_ROWS = 1 << 19
@@ -28,8 +30,11 @@ _MOST_ROWS_PER_BYTE = 1
 _ROWS_PER_PRIMITIVE = 64  # what even an empty one takes, in time
 
 
-def parse_glb(data: bytes, name: str, folder: Path) -> Mesh:
-    """The triangles of the scene, each mesh placed as its nodes say; meters, y up, as in glTF."""
+def parse_glb(data: bytes, name: str, folder: Path) -> Mesh | PointCloud:
+    """The triangles of the scene, each mesh placed as its nodes say; meters, y up, as in glTF.
+
+    A scene that has points and no triangles is a cloud.
+    """
     if data[:4] != b"glTF" or len(data) < 20:
         raise CloudFileError(f"byte 0: starts with {data[:4]!r}, wanted b'glTF' and a header")
     version, length = struct.unpack_from("<II", data, 4)
@@ -50,12 +55,12 @@ def parse_glb(data: bytes, name: str, folder: Path) -> Mesh:
         position += size
     if _JSON_CHUNK not in chunks:
         raise CloudFileError("byte 12: wanted a chunk of JSON, found none")
-    return _Scene(chunks[_JSON_CHUNK], chunks.get(_BINARY_CHUNK), folder).mesh(name)
+    return _Scene(chunks[_JSON_CHUNK], chunks.get(_BINARY_CHUNK), folder).shape(name)
 
 
-def parse_gltf(data: bytes, name: str, folder: Path) -> Mesh:
+def parse_gltf(data: bytes, name: str, folder: Path) -> Mesh | PointCloud:
     """As `parse_glb`; buffers are read from the file's own folder only."""
-    return _Scene(data, None, folder).mesh(name)
+    return _Scene(data, None, folder).shape(name)
 
 
 class _Scene:
@@ -76,14 +81,22 @@ class _Scene:
         if packed:
             raise CloudFileError(f"needs the extension {packed[0]!r}, wanted an uncompressed mesh")
 
-    def mesh(self, name: str) -> Mesh:
-        """All triangles, in the frame of the scene."""
+    def shape(self, name: str) -> Mesh | PointCloud:
+        """All triangles, or the points of a scene without any, in the frame of the scene."""
+        mesh = self._gathered(name, _SURFACES)
+        if len(mesh.triangles) == 0:
+            points = self._gathered(name, (_POINTS,)).vertices
+            if len(points):
+                return cloud_of_filled(np.asarray(points), None, name)
+        return mesh
+
+    def _gathered(self, name: str, modes: tuple[int, ...]) -> Mesh:
         vertices: list[np.ndarray] = [np.empty((0, 3))]
         triangles: list[np.ndarray] = [np.empty((0, 3), np.int64)]
         count = 0
         for index, placement in self._placed_meshes():
             for primitive in _get(self._item("meshes", index), "primitives", list):
-                points, faces = self._primitive(primitive)
+                points, faces = self._primitive(primitive, modes)
                 self.room -= len(points) + len(faces) + _ROWS_PER_PRIMITIVE
                 if self.room < 0:
                     raise CloudFileError("unfolds, by meshes placed again, to more than we read")
@@ -120,9 +133,11 @@ class _Scene:
             todo += [(child, placement) for child in reversed(_get(node, "children", list, []))]
         return placed
 
-    def _primitive(self, primitive: Any) -> tuple[np.ndarray, Int64[np.ndarray, "t 3"]]:
+    def _primitive(
+        self, primitive: Any, modes: tuple[int, ...]
+    ) -> tuple[np.ndarray, Int64[np.ndarray, "t 3"]]:
         mode = _get(primitive, "mode", int, _TRIANGLES)
-        if mode not in (_TRIANGLES, _STRIP, _FAN):  # points and lines have no surface
+        if mode not in modes:
             return np.empty((0, 3)), np.empty((0, 3), np.int64)
         attributes = _get(primitive, "attributes", dict)
         points = as_float64(self._accessor(_get(attributes, "POSITION", int), "VEC3"))
@@ -136,6 +151,8 @@ class _Scene:
                 raise CloudFileError(
                     f"a primitive names vertex {corners.max()}, wanted 0 to {len(points) - 1}"
                 )
+        if mode == _POINTS:
+            return points[corners], np.empty((0, 3), np.int64)
         if mode == _TRIANGLES:
             return points, corners[: len(corners) // 3 * 3].reshape(-1, 3)
         ends = np.arange(2, max(len(corners), 2))

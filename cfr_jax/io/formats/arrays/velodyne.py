@@ -1,0 +1,107 @@
+"""Bare rows of little-endian float32, as the data sets of driving store their LiDAR scans."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float32
+
+from cfr_jax.io.cloud import LARGEST_COORDINATE, CloudFileError, PointCloud
+from cfr_jax.io.mesh import Mesh
+from cfr_jax.io.naming import HOW_TO_SAY, renamed
+from cfr_jax.io.table import table_of
+
+_KITTI = ("x", "y", "z", "intensity")
+_NUSCENES = ("x", "y", "z", "intensity", "ring")
+_MOST_RINGS = 256
+_BRIGHTEST = 255.0
+_FARTHEST = 1e5  # meters; beyond are misread bits
+# Correlations of rows by chance stay below this many deviations.
+_DEVIATIONS = 6.0
+_SAMPLED = 1 << 18
+
+
+def parse(
+    data: bytes, name: str, *, columns: tuple[str, ...] | None = None, whole: bool = False
+) -> PointCloud | Mesh:
+    """Four columns as in KITTI (x, y, z, reflectance), or five as in nuScenes (with the ring).
+
+    The file does not say which. Five columns are told by a last one that holds numbers of rings;
+    four, by reflectances between 0 and 255 and rows that repeat every four numbers and no other
+    count. Raises CloudFileError where neither fits; `columns` then says how many there are.
+    """
+    names = _names(data, name) if columns is None else tuple(renamed(columns, columns))
+    width = len(names)
+    if len(data) % (4 * width):
+        raise CloudFileError(f"has {len(data)} bytes, wanted rows of {4 * width} ({width} float32)")
+    rows = np.frombuffer(data, "<f4").reshape(-1, width)
+    table = table_of(names, [rows[:, k] for k in range(width)], source="Velodyne")
+    return table.shape(name, (), whole)
+
+
+def _names(data: bytes, name: str) -> tuple[str, ...]:
+    if len(data) % 4:
+        raise CloudFileError(f"has {len(data)} bytes, wanted rows of 16 (four float32)")
+    numbers = np.frombuffer(data, "<f4")
+    four = len(numbers) % 4 == 0 and _is_kitti(numbers.reshape(-1, 4))
+    five = len(numbers) % 5 == 0 and _has_rings(numbers.reshape(-1, 5))
+    if five:
+        return _NUSCENES
+    if four and not name.lower().endswith(".pcd.bin"):
+        better = _better_width(numbers)
+        if better is None:
+            return _KITTI
+        raise CloudFileError(
+            f"repeats every {better} numbers and not every four as KITTI; {HOW_TO_SAY}"
+        )
+    raise CloudFileError(
+        f"has {len(data)} bytes that are no rows of 16 as in KITTI (x, y, z, reflectance of 0 to "
+        f"255), nor of 20 as in nuScenes (and a ring of 0 to {_MOST_RINGS - 1}); {HOW_TO_SAY}"
+    )
+
+
+def _is_kitti(rows: Float32[np.ndarray, "n 4"]) -> bool:
+    bright = rows[:, 3]
+    with np.errstate(invalid="ignore"):
+        return bool(np.all(~(bright < 0) & ~(bright > _BRIGHTEST))) and _near(rows)
+
+
+def _has_rings(rows: Float32[np.ndarray, "n 5"]) -> bool:
+    rings = rows[:, 4]
+    with np.errstate(invalid="ignore"):
+        whole = np.all((rings >= 0) & (rings < _MOST_RINGS) & (rings == np.rint(rings)))
+        return bool(whole and np.all(rows[:, 3] >= 0)) and _near(rows)
+
+
+def _near(rows: Float32[np.ndarray, "n k"]) -> bool:
+    """Whether no finite coordinate is implausible for a scan."""
+    points = rows[:, :3]
+    with np.errstate(invalid="ignore"):
+        far = (np.abs(points) > _FARTHEST) & (np.abs(points) <= LARGEST_COORDINATE)
+    return not bool(far.any())
+
+
+def _better_width(numbers: Float32[np.ndarray, " k"]) -> int | None:
+    """How many columns the numbers have more likely than four, if any.
+
+    Numbers of one column are alike, so the sequence correlates with itself at the distance of a
+    row. Chance alone gives one over the square root of the length.
+    """
+    part = numbers[:_SAMPLED].astype(np.float64)
+    part = part[np.isfinite(part)]
+    spread = part.std() if len(part) > 32 else 0.0
+    if spread == 0:
+        return None
+    part = np.clip((part - np.median(part)) / spread, -4, 4)
+    part -= part.mean()
+    power = float(part @ part)
+
+    def likeness(lag: int) -> float:
+        return float(part[lag:] @ part[:-lag]) / power
+
+    chance = _DEVIATIONS / np.sqrt(len(part))
+    four = likeness(4)
+    others = {width: likeness(width) for width in (3, 5, 6) if len(numbers) % width == 0}
+    best = max(others, key=lambda width: others[width], default=None)
+    if best is None or others[best] <= four + max(chance, 0.05):
+        return None
+    return best
