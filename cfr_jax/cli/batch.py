@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cfr_jax.cli.shared import numbers, outputs
+from cfr_jax.cli.shared import clouds, numbers, outputs
 from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.data import kinds
 
@@ -82,6 +82,7 @@ def add_parser(commands: Commands) -> None:
         help=f"exit with {UNTRUSTED} if a pair failed or is not to be trusted",
     )
     how = parser.add_argument_group("how to register")
+    clouds.add_columns(how)
     how.add_argument("--no-refine", action="store_true", help="take the network's own answers")
     how.add_argument(
         "--no-second-look", action="store_true", help="keep the first answers, even if in doubt"
@@ -122,10 +123,12 @@ def _kinds() -> str:
     )
 
 
+@clouds.telling("cfr batch")
 def run(args: argparse.Namespace) -> int:
     """Checks the arguments, registers the pairs that are not done yet, and writes the table."""
     outputs.check_output("--out", args.out, (".csv",))
     outputs.check_apart([args.pairs, *filter(None, [args.target])], [args.out])
+    clouds.columns_of(args)
 
     from cfr_jax.batch.jobs import jobs_of
     from cfr_jax.data.layout import recognize
@@ -154,6 +157,7 @@ def run(args: argparse.Namespace) -> int:
         "max_points": args.max_points,
         "all_points": not args.thinned,
         "seed": args.seed,
+        "columns": args.columns,
     }
     kept = out.with_suffix(".jsonl")
     outputs.check_output("--out", kept)
@@ -184,7 +188,7 @@ def _register(left: list[Job], journal: Journal, params: Params, args: argparse.
     if not left:
         return
     outcomes = align_many(
-        (job.pair for job in left),
+        clouds.with_columns((job.pair for job in left), args),
         params=params,
         refine=not args.no_refine,
         second_look=not args.no_second_look,

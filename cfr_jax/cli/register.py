@@ -6,14 +6,12 @@ import argparse
 import importlib.util
 import json
 import sys
-import textwrap
 from pathlib import Path
 from typing import Any
 
 from cfr_jax import refine
-from cfr_jax.cli.shared import numbers, outputs
+from cfr_jax.cli.shared import clouds, numbers, outputs
 from cfr_jax.cli.shared.commands import Commands
-from cfr_jax.io import formats
 from cfr_jax.runtime import optional
 
 UNTRUSTED = 3
@@ -57,7 +55,7 @@ def add_parser(commands: Commands) -> None:
         "register",
         help="find the motion that lays one point cloud on another",
         description=_DESCRIPTION,
-        epilog=_EPILOG.format(files=_files()),
+        epilog=_EPILOG.format(files=clouds.files_in_words()),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
@@ -70,7 +68,8 @@ def add_parser(commands: Commands) -> None:
         "--out",
         metavar="FILE",
         type=Path,
-        help=f"the moved source, all its points ({' '.join(outputs.cloud_suffixes())})",
+        help="the moved source with all that its file holds "
+        f"({' '.join(outputs.cloud_suffixes())})",
     )
     written.add_argument(
         "--json",
@@ -90,6 +89,7 @@ def add_parser(commands: Commands) -> None:
     )
 
     how = parser.add_argument_group("how to register")
+    clouds.add_columns(how)
     after = how.add_mutually_exclusive_group()
     after.add_argument(
         "--no-refine",
@@ -156,27 +156,7 @@ def add_parser(commands: Commands) -> None:
     )
 
 
-def _files() -> str:
-    """The formats that can be read, as wrapped lines."""
-    bare = [form for form in formats.known() if form.holds == "surface"]
-    either = [form for form in formats.known() if form.holds == "either"]
-    surfaces = f"{formats.in_words(bare)}, and {formats.in_words(either)} with faces: points are"
-    lines = {
-        "clouds": formats.in_words(formats.of_clouds()),
-        "surfaces": f"{surfaces} drawn from them by area",
-    }
-    return "\n".join(
-        textwrap.fill(
-            text,
-            width=100,
-            initial_indent=f"  {sort:10s}",
-            subsequent_indent=" " * 12,
-            break_on_hyphens=False,
-        )
-        for sort, text in lines.items()
-    )
-
-
+@clouds.telling("cfr register")
 def run(args: argparse.Namespace) -> int:
     """Reads, registers and writes; what can be checked is checked before JAX is imported."""
     if args.all_points:
@@ -193,7 +173,11 @@ def run(args: argparse.Namespace) -> int:
     if args.initial is not None:
         motions = [read_transform(path) for path in args.initial]
         initial = motions[0] if len(motions) == 1 else np.stack(motions)
-    source, target = io.read(args.source, seed=args.seed), io.read(args.target, seed=args.seed)
+    columns = clouds.columns_of(args)
+    source = io.read(
+        args.source, seed=args.seed, columns=columns[0], properties=args.out is not None
+    )
+    target = io.read(args.target, seed=args.seed, columns=columns[1])
 
     from cfr_jax.cli.shared import report
     from cfr_jax.cli.shared.cache import keep_compiled_programs
@@ -214,6 +198,9 @@ def run(args: argparse.Namespace) -> int:
         io.write(args.out, result.moved_source())
     if args.json is not None:
         document = report.as_document(result, str(args.source), str(args.target))
+        for role, names in zip(("source", "target"), columns, strict=True):
+            if names is not None:
+                document[role]["columns"] = list(names)
         _write_json(None if to_stdout else args.json, document)
     if args.view is not None or args.png is not None:
         pictures = [path for path in (args.view, args.png) if path is not None]

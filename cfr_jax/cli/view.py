@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared import clouds, outputs
 from cfr_jax.cli.shared.commands import Commands
 
 _DESCRIPTION = """\
@@ -51,6 +51,7 @@ def add_parser(commands: Commands) -> None:
 _SUFFIXES = (*outputs.PAGE_SUFFIXES, *outputs.PICTURE_SUFFIXES, *outputs.RECORDING_SUFFIXES)
 
 
+@clouds.telling("cfr view")
 def run(args: argparse.Namespace) -> int:
     """Reads the result and its clouds, and draws them."""
     wanted = args.out or [args.result.with_suffix(".html")]

@@ -34,10 +34,20 @@ class Result:
     alignment: Alignment
 
     def moved_source(self) -> PointCloud:
-        """The whole source, moved onto the target."""
-        transform, normals = self.alignment.transform, self.source.normals
-        normals = None if normals is None else motions.rotate(transform, normals)
-        return PointCloud(motions.apply(transform, self.source.points), normals, self.source.name)
+        """The whole source, moved onto the target, with all columns that it was read with."""
+        transform, source = self.alignment.transform, self.source
+
+        def turned(normals: np.ndarray | None) -> np.ndarray | None:
+            return None if normals is None else motions.rotate(transform, normals)
+
+        table = source.table
+        if table is not None:
+            with np.errstate(invalid="ignore"):  # rows without a point are infinite or NaN
+                table = table.moved(
+                    motions.apply(transform, table.points()), turned(table.normals())
+                )
+        points = motions.apply(transform, source.points)
+        return PointCloud(points, turned(source.normals), source.name, table=table)
 
 
 def register(
@@ -173,7 +183,8 @@ def _cloud(cloud: PointCloud, path: str, used: int) -> dict[str, Any]:
 
 
 def _counts(cloud: PointCloud, used: int) -> str:
-    return f"{len(cloud):,} points, {used:,} used"
+    empty = f", {cloud.left_out:,} rows without a point left out" if cloud.left_out else ""
+    return f"{len(cloud):,} points, {used:,} used{empty}"
 
 
 def _row(row: Float64[np.ndarray, " 4"]) -> str:

@@ -53,6 +53,9 @@ def read_result(path: Path) -> dict[str, Any]:
         for role in ("source", "target"):
             if not isinstance(document[role].get("path"), str):
                 raise ValueError(f'does not say where its "{role}" is')
+            columns = document[role].get("columns", [])
+            if not isinstance(columns, list) or not all(isinstance(c, str) for c in columns):
+                raise ValueError(f'the "columns" of its "{role}" are not names')
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
@@ -81,7 +84,10 @@ def find_cloud(document: dict[str, Any], role: str, result: Path, given: Path | 
 
 def read_clouds(document: dict[str, Any], paths: dict[str, Path]) -> dict[str, PointCloud]:
     """The two clouds, sampled as before; raises ValueError if a number of points has changed."""
-    clouds = {role: io.read(path, seed=document["seed"]) for role, path in paths.items()}
+    clouds = {
+        role: io.read(path, seed=document["seed"], columns=document[role].get("columns"))
+        for role, path in paths.items()
+    }
     for role, cloud in clouds.items():
         had = document[role].get("points", len(cloud))
         if len(cloud) != had:

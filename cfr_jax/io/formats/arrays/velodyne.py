@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from cfr_jax.io.cloud import LARGEST_COORDINATE, CloudFileError, PointCloud
 from cfr_jax.io.mesh import Mesh
-from cfr_jax.io.naming import HOW_TO_SAY, renamed
+from cfr_jax.io.naming import HOW_TO_SAY
 from cfr_jax.io.table import table_of
 
 _KITTI = ("x", "y", "z", "intensity")
 _NUSCENES = ("x", "y", "z", "intensity", "ring")
-_MOST_RINGS = 256
+_MOST_RINGS = 128  # of the largest scanners; colors go to 255
 _BRIGHTEST = 255.0
 _FARTHEST = 1e5  # meters; beyond are misread bits
 # Correlations of rows by chance stay below this many deviations.
-_DEVIATIONS = 6.0
+_DEVIATIONS = 4.0
+_CLEARLY = 0.05
+_MOST_COLUMNS = 12
 _SAMPLED = 1 << 18
 
 
@@ -26,10 +28,10 @@ def parse(
     """Four columns as in KITTI (x, y, z, reflectance), or five as in nuScenes (with the ring).
 
     The file does not say which. Five columns are told by a last one that holds numbers of rings;
-    four, by reflectances between 0 and 255 and rows that repeat every four numbers and no other
-    count. Raises CloudFileError where neither fits; `columns` then says how many there are.
+    four, by reflectances between 0 and 255. In both, the numbers have to repeat every so many.
+    Raises CloudFileError where neither fits; `columns` then says how many there are.
     """
-    names = _names(data, name) if columns is None else tuple(renamed(columns, columns))
+    names = _names(data, name) if columns is None else columns
     width = len(names)
     if len(data) % (4 * width):
         raise CloudFileError(f"has {len(data)} bytes, wanted rows of {4 * width} ({width} float32)")
@@ -44,14 +46,13 @@ def _names(data: bytes, name: str) -> tuple[str, ...]:
     numbers = np.frombuffer(data, "<f4")
     four = len(numbers) % 4 == 0 and _is_kitti(numbers.reshape(-1, 4))
     five = len(numbers) % 5 == 0 and _has_rings(numbers.reshape(-1, 5))
-    if five:
-        return _NUSCENES
-    if four and not name.lower().endswith(".pcd.bin"):
-        better = _better_width(numbers)
+    if five or (four and not name.lower().endswith(".pcd.bin")):
+        names = _NUSCENES if five else _KITTI
+        better = _better_width(numbers, len(names))
         if better is None:
-            return _KITTI
+            return names
         raise CloudFileError(
-            f"repeats every {better} numbers and not every four as KITTI; {HOW_TO_SAY}"
+            f"repeats every {better} numbers and not every {len(names)}; {HOW_TO_SAY}"
         )
     raise CloudFileError(
         f"has {len(data)} bytes that are no rows of 16 as in KITTI (x, y, z, reflectance of 0 to "
@@ -80,28 +81,38 @@ def _near(rows: Float32[np.ndarray, "n k"]) -> bool:
     return not bool(far.any())
 
 
-def _better_width(numbers: Float32[np.ndarray, " k"]) -> int | None:
-    """How many columns the numbers have more likely than four, if any.
+def _better_width(numbers: Float32[np.ndarray, " k"], width: int) -> int | None:
+    """How many columns the numbers have more likely than `width`, if any.
 
     Numbers of one column are alike, so the sequence correlates with itself at the distance of a
     row. Chance alone gives one over the square root of the length.
     """
     part = numbers[:_SAMPLED].astype(np.float64)
     part = part[np.isfinite(part)]
-    spread = part.std() if len(part) > 32 else 0.0
+    if len(part) < 2 * _MOST_COLUMNS:
+        return None
+    size = np.abs(part)
+    others = [
+        other
+        for other in range(3, _MOST_COLUMNS + 1)
+        if other != width and len(numbers) % other == 0
+    ]
+    # Columns differ in their values, and those about zero in their size.
+    for feature in (part, np.log(size + 1e-3 * np.median(size) + 1e-30)):
+        alike = _likeness(feature, [width, *others])
+        chance = max(_DEVIATIONS / np.sqrt(len(part)), _CLEARLY)
+        best = int(np.argmax(alike))
+        if alike[best] > alike[0] + chance:
+            return others[best - 1]
+    return None
+
+
+def _likeness(numbers: Float64[np.ndarray, " k"], lags: list[int]) -> list[float]:
+    """The correlation of numbers with those that come so many later."""
+    spread = numbers.std()
     if spread == 0:
-        return None
-    part = np.clip((part - np.median(part)) / spread, -4, 4)
-    part -= part.mean()
-    power = float(part @ part)
-
-    def likeness(lag: int) -> float:
-        return float(part[lag:] @ part[:-lag]) / power
-
-    chance = _DEVIATIONS / np.sqrt(len(part))
-    four = likeness(4)
-    others = {width: likeness(width) for width in (3, 5, 6) if len(numbers) % width == 0}
-    best = max(others, key=lambda width: others[width], default=None)
-    if best is None or others[best] <= four + max(chance, 0.05):
-        return None
-    return best
+        return [0.0] * len(lags)
+    numbers = np.clip((numbers - np.median(numbers)) / spread, -4, 4)
+    numbers = numbers - numbers.mean()
+    power = float(numbers @ numbers) or 1.0
+    return [float(numbers[lag:] @ numbers[:-lag]) / power for lag in lags]
