@@ -39,6 +39,12 @@ class Table:
     rest: Any = None
     source: str = ""
 
+    @property
+    def is_bare(self) -> bool:
+        """Whether there is nothing but points and normals, in this order."""
+        roles = (*self.roles.points, *self.roles.normals)
+        return roles == tuple(range(len(self.values)))
+
     def points(self) -> Float64[np.ndarray, "n 3"]:
         """x, y, z of all rows, also of those that hold no point."""
         return self._stacked(self.roles.points)
@@ -194,8 +200,6 @@ def without_faces(cloud: PointCloud, form: str) -> tuple[Table, list[str]]:
     if table is None:
         return plain_table(cloud), []
     if table.polygons is not None and len(table.polygons[2]):
-        note = (
-            f"{form} holds no faces: wrote the {len(cloud)} points drawn from them; .ply holds both"
-        )
+        note = f"{form} holds no faces: wrote {len(cloud)} points drawn from them; .ply holds both"
         return plain_table(cloud), [note]
     return table, []

@@ -16,6 +16,7 @@ _DESCR = re.compile(r"""['"]descr['"]\s*:\s*(['"][<>|=]?[A-Za-z]\w*['"]|\[[^\]]*
 _ORDER = re.compile(r"""['"]fortran_order['"]\s*:\s*(True|False)\b""")
 _SHAPE = re.compile(r"""['"]shape['"]\s*:\s*\(([\d,\s]*)\)""")
 _LONGEST_HEADER = 10_000
+_KINDS = "fiubSU"  # words and flags may stand beside the points
 # What converting to float64 may take; bytes and half floats grow eightfold and fourfold.
 _ALWAYS_ALLOWED, _PER_BYTE = 40 << 20, 2.5
 
@@ -36,6 +37,8 @@ def table_of_array(
     array: np.ndarray, columns: tuple[str, ...] | None, size: int
 ) -> tuple[Table, tuple[str, ...]]:
     """The columns of an array that a file of `size` bytes holds, and notes on their meaning."""
+    if not array.dtype.names and array.dtype.kind not in "fiu":
+        raise CloudFileError(f"holds {array.dtype}, wanted floats or integers")
     if not array.dtype.names and array.ndim not in (2, 3):
         raise CloudFileError(f"the shape is {array.shape}, wanted (n, 3) or (n, 6)")
     rows = array.size if array.dtype.names else array.size // max(array.shape[-1], 1)
@@ -101,11 +104,11 @@ def _dtype(text: str, start: int) -> np.dtype:
     except (TypeError, ValueError, SyntaxError, IndexError, RecursionError, MemoryError):
         raise CloudFileError(f"byte {start}: unknown number type {text!r:.80}") from None
     if dtype.names is None:
-        if dtype.kind not in "fiu":
+        if dtype.kind not in _KINDS:
             raise CloudFileError(f"byte {start}: holds {dtype}, wanted floats or integers")
         return dtype
     for name in dtype.names:
         inner = dtype[name].base
-        if inner.kind not in "fiubSU" or inner.names or len(dtype[name].shape) > 1:
+        if inner.kind not in _KINDS or inner.names or len(dtype[name].shape) > 1:
             raise CloudFileError(f"byte {start}: field {name!r} is {dtype[name]}, wanted numbers")
     return dtype

@@ -20,12 +20,10 @@ def save_npy(stream: BinaryIO, cloud: PointCloud) -> list[str]:
 
 def _as_array(table: Table) -> np.ndarray:
     kinds = {values.dtype for values in table.values}
-    flat = all(values.ndim == 1 for values in table.values)
-    if len(kinds) == 1 and flat and not table.named:
-        return np.stack(table.values, axis=1)
-    if len(table.values) <= 2 and set(table.roles.points) | set(table.roles.normals) == set(
-        range(len(table.values))
-    ):
+    fields_before = table.named and table.source == "NPY"
+    if len(kinds) == 1 and not fields_before and (table.is_bare or not table.named):
+        if all(values.ndim == 1 for values in table.values):
+            return np.stack(table.values, axis=1)
         return np.hstack(table.values)
     fields = [
         (name, values.dtype, values.shape[1:])
