@@ -173,7 +173,7 @@ sys.exit(f"{heavy}" if heavy else "jax" in sys.modules)
 @pytest.mark.parametrize(
     ("page", "listed"),
     [
-        ("recipes.md", formats.known()),
+        ("files.md", formats.known()),
         ("train-on-your-data.md", [form for form in formats.known() if form.loose]),
     ],
 )

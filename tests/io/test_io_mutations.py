@@ -20,8 +20,9 @@ from pathlib import Path
 
 import numpy as np
 from io_samples import write_clouds, write_meshes
+from kind_samples import all_kinds, solids
 
-CASES = 2000
+CASES = 4000
 SECONDS = 1.0
 BYTES = 64 << 20
 BYTES_PER_BYTE = 4
@@ -81,6 +82,8 @@ def run_cases(cases: int, seed: int) -> dict:
         place = Path(folder)
         files = {**write_clouds(place), **write_meshes(place)}
         originals = {name: path.read_bytes() for name, path in sorted(files.items())}
+        originals |= {f"{kind} {name}": data for kind, (name, data) in all_kinds().items()}
+        originals["solids.stl"] = solids()
         for path in files.values():  # what is loaded only once is no cost of a case
             read(path)
         names = sorted(originals)
@@ -93,7 +96,7 @@ def run_cases(cases: int, seed: int) -> dict:
             before = _reset_peak()
             start = time.perf_counter()
             try:
-                cloud = read(path)
+                cloud = read(path, properties=case % 2 == 1)
                 assert len(cloud) > 0 and np.isfinite(cloud.points).all()
             except CloudFileError as error:
                 refused += 1

@@ -87,8 +87,8 @@ def _better_width(numbers: Float32[np.ndarray, " k"], width: int) -> int | None:
     Numbers of one column are alike, so the sequence correlates with itself at the distance of a
     row. Chance alone gives one over the square root of the length.
     """
-    part = numbers[:_SAMPLED].astype(np.float64)
-    part = part[np.isfinite(part)]
+    part = numbers[:_SAMPLED]
+    part = part[np.isfinite(part)].astype(np.float64)
     if len(part) < 2 * _MOST_COLUMNS:
         return None
     size = np.abs(part)

@@ -67,17 +67,29 @@ def _typed(block: bytes, line: int, layout: Layout, kinds: list[str]) -> list[np
                 kinds[unfit.column] = "f8" if kinds[unfit.column] == "i8" else "U"
                 continue
             found = {k: rows[f"f{k}"] for k in chosen}
-        if len(chosen) < len(kinds):
-            reader = csv.reader(
-                block.decode("utf-8", "replace").splitlines(),
-                delimiter=layout.delimiter or " ",
-                skipinitialspace=True,
-            )
-            cells = [row for row in reader if row]
-            for k, kind in enumerate(kinds):
-                if kind == "U":
-                    found[k] = np.array([row[k].strip() for row in cells])
+        words = [k for k, kind in enumerate(kinds) if kind == "U"]
+        if words:
+            cells = _cells(block, line, layout)
+            found |= {k: np.array([row[k].strip() for row in cells]) for k in words}
+        if len({len(values) for values in found.values()}) > 1:
+            raise _uneven(line)
         return [found[k] for k in range(len(kinds))]
+
+
+def _cells(block: bytes, line: int, layout: Layout) -> list[list[str]]:
+    """The cells of a block's rows, as words."""
+    reader = csv.reader(
+        block.decode("utf-8", "replace").split("\n"),
+        delimiter=layout.delimiter or " ",
+        skipinitialspace=True,
+    )
+    try:
+        rows = [row for row in reader if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise CloudFileError(f"behind line {line}: {error}") from None
+    if any(len(row) < layout.width for row in rows):
+        raise _uneven(line)
+    return rows
 
 
 class _Unfit(ValueError):

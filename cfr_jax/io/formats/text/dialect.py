@@ -117,7 +117,7 @@ def _lines(data: bytes) -> Iterator[tuple[int, int, str]]:
         number += 1
         line = data[offset : min(end, offset + _HEAD)].decode("utf-8", "replace").strip()
         if line:
-            yield number, offset, line
+            yield number, offset, line.partition("\r")[0].strip()  # the body cuts there, too
         offset = end + 1
 
 
