@@ -125,7 +125,7 @@ def test_the_user_says_what_the_columns_are(tmp_path):
     [
         ("a.txt", "x,y", r"columns: has no z among x, y"),
         ("a.txt", "x,y,z,z", "'z' 2 times"),
-        ("a.txt", ["x", "y", 3], "wanted names"),
+        ("a.txt", ["x", "y", " "], "wanted names"),
         ("a.txt", "t,x,y,z,i", "got 5 names .* 3 columns"),
         ("a.bin", "x,y,z,i,j,k,l", "wanted rows of 28"),
         ("a.stl", "x,y,z", "STL files say themselves"),
