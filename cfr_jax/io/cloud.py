@@ -31,7 +31,8 @@ class CloudWarning(UserWarning):
 
     def __init__(self, about: object, note: str) -> None:
         super().__init__(f"{about}: {note}")
-        self.about, self.note = str(about), note
+        self.about: str = str(about)
+        self.note: str = note
 
 
 @dataclass(frozen=True, eq=False)
