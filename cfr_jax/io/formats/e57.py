@@ -8,6 +8,7 @@ from types import ModuleType
 
 import numpy as np
 
+from cfr_jax.io.budget import check_room
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.table import cloud_of_filled, table_of
 
@@ -23,8 +24,6 @@ _PROPERTIES = {
     "returnIndex": "return_number",
     "returnCount": "number_of_returns",
 }
-# A point is 24 bytes here; in a file that is bit-packed it may be six.
-_ALWAYS_ALLOWED, _PER_BYTE = 40 << 20, 3
 
 
 def parse(
@@ -66,8 +65,7 @@ def _scans(pye57: ModuleType, path: Path, size: int, whole: bool) -> list[dict[s
         counts = [file.get_header(k).point_count for k in range(file.scan_count)]
         if not counts or sum(counts) == 0:
             raise CloudFileError("holds no points, wanted at least one")
-        if 24 * sum(counts) > _ALWAYS_ALLOWED + _PER_BYTE * size:
-            raise CloudFileError(f"says {sum(counts)} points in {size} bytes, more than we read")
+        check_room(sum(counts), 24, size, "points")
         return [_scan(file, k, whole) for k in range(len(counts))]
     finally:
         file.close()

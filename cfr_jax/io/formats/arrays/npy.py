@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 
+from cfr_jax.io.budget import check_room
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.mesh import Mesh
 from cfr_jax.io.table import Table, table_of, unnamed_table
@@ -17,8 +18,6 @@ _ORDER = re.compile(r"""['"]fortran_order['"]\s*:\s*(True|False)\b""")
 _SHAPE = re.compile(r"""['"]shape['"]\s*:\s*\(([\d,\s]*)\)""")
 _LONGEST_HEADER = 10_000
 _KINDS = "fiubSU"  # words and flags may stand beside the points
-# What converting to float64 may take; bytes and half floats grow eightfold and fourfold.
-_ALWAYS_ALLOWED, _PER_BYTE = 40 << 20, 2.5
 
 
 def parse(
@@ -42,11 +41,7 @@ def table_of_array(
     if not array.dtype.names and array.ndim not in (2, 3):
         raise CloudFileError(f"the shape is {array.shape}, wanted (n, 3) or (n, 6)")
     rows = array.size if array.dtype.names else array.size // max(array.shape[-1], 1)
-    if array.dtype.itemsize < 8 and 24 * rows > _ALWAYS_ALLOWED + _PER_BYTE * size:
-        raise CloudFileError(
-            f"{rows} points of {array.dtype} in {size} bytes are more than we read, "
-            "wanted float32 or a smaller file"
-        )
+    check_room(rows, 24, size, f"points of {array.dtype}")
     if array.dtype.names:
         rows_of_all = array.reshape(-1)
         names = list(array.dtype.names)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cfr_jax.io.budget import check_room
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.formats.pcd.lzf import LARGEST_RATIO, decompress
 from cfr_jax.io.formats.text.lines import Lines, clean_text
@@ -29,7 +30,6 @@ _KNOWN = (
     "VERSION", "FIELDS", "COLUMNS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT",
     "POINTS", "DATA",
 )  # fmt: skip
-_ALWAYS_ALLOWED, _PER_BYTE = 40 << 20, 2.5
 
 
 @dataclass(frozen=True)
@@ -60,16 +60,13 @@ def parse(
     counted in `left_out`. VIEWPOINT is not applied: points stay in the frame of the sensor.
     """
     header = _parse_header(data)
-    if 24 * header.points > _ALWAYS_ALLOWED + _PER_BYTE * len(data):
-        raise CloudFileError(
-            f"POINTS: {header.points} points in {len(data)} bytes are more than we read"
-        )
     if header.storage == "ascii":
         values = _read_text(data, header)
     elif header.storage == "binary":
         values = _read_rows(data, header)
     else:
         values = _read_compressed(data, header)
+    check_room(header.points, 24, len(data), "points")
     return _table(header, values, columns, whole).shape(name, (), whole)
 
 

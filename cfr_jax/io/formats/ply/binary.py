@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Int64
 
+from cfr_jax.io.budget import check_room
 from cfr_jax.io.cloud import CloudFileError
 from cfr_jax.io.formats.ply.elements import Element, Held, Property, Ragged, gathered, wanted_of
 
@@ -96,6 +97,7 @@ def _unequal_rows(
     data: bytes, offset: int, order: str, element: Element, wanted: list[bool]
 ) -> tuple[Held, int]:
     """The properties of rows that differ in size, and the offset behind them."""
+    check_room(element.count, 24, len(data), "rows of different sizes")
     octets = np.frombuffer(data, np.uint8)
     parts: list[list] = [[] for _ in element.properties]
     sizes: list[list] = [[] for _ in element.properties]
@@ -128,6 +130,8 @@ def _unequal_rows(
             held.append(np.concatenate(part))
         else:
             held.append(Ragged(np.concatenate(part), np.concatenate(size)))
+        part.clear()
+        size.clear()
     return held, offset
 
 

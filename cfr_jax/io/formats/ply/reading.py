@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 
+from cfr_jax.io.budget import check_room
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.formats.ply.binary import read_binary
 from cfr_jax.io.formats.ply.elements import (
@@ -48,12 +49,18 @@ def parse(
         if column is not None and not isinstance(column, Ragged):
             names.append(prop.name)
             values.append(column)
+    each = 48 if whole and elements[vertex].has_lists else 24
+    check_room(elements[vertex].count, each, len(data), "vertices")
+    polygons = _polygons(elements, held)
+    if polygons is not None:
+        corners = int(polygons[2].sum(dtype="i8"))
+        check_room(max(corners - 2 * len(polygons[2]), 0), 24, len(data), "triangles")
     try:
         table = table_of(
             names,
             values,
             columns,
-            polygons=_polygons(elements, held),
+            polygons=polygons,
             rest=(elements, held, vertex) if whole else None,
             source=SOURCE,
         )

@@ -10,14 +10,13 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float64
 
+from cfr_jax.io.budget import check_room
 from cfr_jax.io.cloud import CloudFileError
 from cfr_jax.io.formats.text.dialect import Layout
 from cfr_jax.io.formats.text.lines import bad_line
 
 _BLOCK = 1 << 20
 _COMMENT = re.compile(rb"(#|//)[^\n]*")
-# Of a file of so many bytes we make numbers of so many; rows of three digits would be more.
-_ALWAYS_ALLOWED, _PER_BYTE = 40 << 20, 2.5
 _CANNOT = re.compile(r"could not convert string .* at row \d+, column (\d+)")
 
 
@@ -28,17 +27,12 @@ def read_numbers(
     width = layout.width if columns is None else len(columns)
     most = data.count(b"\n", layout.body) + 1
     table = np.empty((most, width))
-    room = (_ALWAYS_ALLOWED + _PER_BYTE * len(data)) / (8 * max(width, 1))
     done = 0
     for line, block in blocks(data, layout):
         rows = _load(block, line, layout, columns, np.dtype(np.float64))
         if len(rows) and rows.shape[1] != width:
             raise _uneven(line)
-        if done + len(rows) > room:
-            raise CloudFileError(
-                f"line {line}: more than {done} rows of {width} numbers in {len(data)} bytes, "
-                "wanted longer rows or a smaller file"
-            )
+        check_room(done + len(rows), 8 * width, len(data), "rows of numbers and more")
         table[done : done + len(rows)] = rows
         done += len(rows)
     return table[:done]
@@ -48,10 +42,17 @@ def read_columns(data: bytes, layout: Layout) -> list[np.ndarray]:
     """All columns, each in the narrowest type of int64, float64 and text that holds it."""
     kinds = ["i8"] * layout.width
     parts: list[list[np.ndarray]] = [[] for _ in kinds]
+    taken = 0
     for line, block in blocks(data, layout):
         for column, part in enumerate(_typed(block, line, layout, kinds)):
             parts[column].append(part)
-    return [np.concatenate(part) if part else np.empty(0) for part in parts]
+            taken += part.nbytes + 8 * len(part) * (column < 3)  # and as points
+        check_room(taken, 1, len(data), "bytes of columns and more")
+    columns = []
+    for pieces in parts:
+        columns.append(np.concatenate(pieces) if pieces else np.empty(0))
+        pieces.clear()
+    return columns
 
 
 def _typed(block: bytes, line: int, layout: Layout, kinds: list[str]) -> list[np.ndarray]:
@@ -84,10 +85,10 @@ def _cells(block: bytes, line: int, layout: Layout) -> list[list[str]]:
         skipinitialspace=True,
     )
     try:
-        rows = [row for row in reader if any(cell.strip() for cell in row)]
+        rows = [row for row in reader if row and (len(row) > 1 or row[0].strip())]
     except csv.Error as error:
         raise CloudFileError(f"behind line {line}: {error}") from None
-    if any(len(row) < layout.width for row in rows):
+    if min(map(len, rows), default=layout.width) < layout.width:
         raise _uneven(line)
     return rows
 

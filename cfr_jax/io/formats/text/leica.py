@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
+from cfr_jax.io.budget import check_room
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.formats.text.body import read_numbers
 from cfr_jax.io.formats.text.dialect import decoded, layout_of
@@ -92,6 +93,7 @@ def _scan(text: bytes, offset: int, line: int) -> tuple[Float64[np.ndarray, "n c
     if count == 0 or body.count(b"\n") + (not body.endswith(b"\n")) < count:
         raise CloudFileError(f"line {line}: wanted {count} points, the file holds fewer")
     layout = replace(layout_of(body, ("x", "y", "z")), line=line)
+    check_room(count, 8 * layout.width + 48, len(text), "points")  # placed, and as a cloud
     rows = read_numbers(body, layout, None)
     if len(rows) != count or rows.shape[1] < 3:
         raise CloudFileError(f"line {line}: wanted {count} points, got {len(rows)}")

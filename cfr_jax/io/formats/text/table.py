@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+from jaxtyping import Float64
+
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.formats.text.body import read_columns, read_numbers
 from cfr_jax.io.formats.text.dialect import Layout, decoded, layout_of
 from cfr_jax.io.mesh import Mesh
-from cfr_jax.io.naming import renamed, roles_of
-from cfr_jax.io.table import Table, table_of, unnamed_table
+from cfr_jax.io.naming import Roles, renamed, roles_of
+from cfr_jax.io.table import Table, unnamed_table
 from cfr_jax.io.unnamed import roles_of_unnamed
 
 SOURCE = "text"
@@ -72,14 +75,15 @@ def parsed(
         roles = roles_of(names)
         chosen = (*roles.points, *roles.normals)
         numbers = read_numbers(text, layout, chosen)
-        table, notes = table_of([names[k] for k in chosen], list(numbers.T)), ()
+        table, notes = _bare(numbers, bool(roles.normals)), ()
     else:
         first = layout.skipped
         seen = 6 if layout.width - first == 6 else min(layout.width - first, 4)
         chosen = tuple(range(first, first + seen))
         all_of_them = layout.width == seen and not layout.quoted
         numbers = read_numbers(text, layout, None if all_of_them else chosen)
-        table, notes = _judged(list(numbers.T), layout.width - first)
+        roles, notes = _judged(list(numbers.T), layout.width - first)
+        table = _bare(numbers, bool(roles.normals))
     count = len(table.values[0])
     if layout.count is not None and count != layout.count:
         raise CloudFileError(f"says in front that it has {layout.count} points, holds {count}")
@@ -106,10 +110,13 @@ def _check_numbers(columns: list) -> None:
             raise CloudFileError(f"wanted numbers, got {values[0]!r:.40} and the like")
 
 
-def _judged(values: list, width: int) -> tuple[Table, tuple[str, ...]]:
-    """As `unnamed_table`, of a table whose first columns alone were read."""
-    if len(values) == width:
-        return unnamed_table(values, source=SOURCE)
-    roles, notes = roles_of_unnamed([*values, *values[:1] * (width - len(values))])
-    names = tuple(f"column_{k + 1}" for k in range(len(values)))
-    return Table(names, tuple(values), roles, False, source=SOURCE), notes
+def _judged(values: list, width: int) -> tuple[Roles, tuple[str, ...]]:
+    """The roles in a table whose first columns alone were read."""
+    return roles_of_unnamed([*values, *values[:1] * (width - len(values))])
+
+
+def _bare(numbers: Float64[np.ndarray, "n c"], normals: bool) -> Table:
+    """Points, and perhaps normals, that stand side by side; they are not copied."""
+    if not normals:
+        return Table(("points",), (numbers[:, :3],), Roles((0,)))
+    return Table(("points", "normals"), (numbers[:, :3], numbers[:, 3:6]), Roles((0,), (1,)))
