@@ -6,20 +6,17 @@ All of this is told from the first lines; the body is then read by numpy's parse
 from __future__ import annotations
 
 import codecs
-import csv
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from cfr_jax.io.cloud import CloudFileError
-from cfr_jax.io.naming import HOW_TO_SAY, are_names, roles_of
+from cfr_jax.io.formats.text.cells import WORD_BREAK, delimiter_of, is_number, names_of, split
+from cfr_jax.io.naming import are_names
 
 _HEAD = 1 << 16  # bytes in which the first row of numbers has to begin
 _COMMENT_MARKS = ("#", "//", "%", "!")
 _SEPARATOR_LINE = re.compile(r"sep\s*=\s*(.)", re.IGNORECASE)
-_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
-_WORD_BREAK = re.compile(r"[\s,;]+")
-_PROSE = ("columns", "column", "fields", "field", "format", "names", "header", "data")
 
 
 @dataclass(frozen=True)
@@ -101,7 +98,7 @@ def layout_of(data: bytes, columns: tuple[str, ...] | None) -> Layout:
             heads.append((number, line))
     if heads:
         number, line = heads[0]
-        if are_names(_split(line, _delimiter_of(line, separator)[0])):
+        if are_names(split(line, delimiter_of(line, separator)[0])):
             raise CloudFileError("holds no points below its line of names, wanted one at least")
         raise CloudFileError(f"line {number}: wanted numbers or names of columns, got {line!r:.80}")
     raise CloudFileError("holds no points, wanted a line of x, y, z at least")
@@ -128,8 +125,8 @@ def _is_last(data: bytes, offset: int, line: str) -> bool:
 
 def _is_row(line: str) -> bool:
     """Whether a line has three numbers at least, or nothing but numbers."""
-    words = [word.strip("\"'") for word in _WORD_BREAK.split(_uncommented(line)) if word]
-    numbers = sum(map(_is_number, words))
+    words = [word.strip("\"'") for word in WORD_BREAK.split(_uncommented(line)) if word]
+    numbers = sum(map(is_number, words))
     return numbers >= 3 or (numbers > 0 and numbers == len(words))
 
 
@@ -153,45 +150,6 @@ def _are_numbered(line: str, heads: list[tuple[int, str]], data: bytes, offset: 
     return bool(following) and b"." in following[0]
 
 
-def _is_number(word: str) -> bool:
-    try:
-        float(word.replace("_", "?"))  # Python allows 1_000, numpy does not
-    except ValueError:
-        return False
-    return True
-
-
-def _delimiter_of(line: str, separator: str | None) -> tuple[str | None, bool, bool]:
-    """The delimiter of a row, whether commas are decimal, and whether they are mere blanks."""
-    if separator is not None and separator in line:
-        return (None if separator == " " else separator), separator != "," and "," in line, False
-    if ";" in line:
-        return ";", "," in line and "." not in line, False
-    words = line.split()
-    if "," in line:
-        if len(words) >= 3 and all(
-            _DECIMAL_COMMA.fullmatch(word) or _is_number(word) for word in words
-        ):
-            return ("\t" if "\t" in line and " " not in line else None), True, False
-        cells = [cell.strip() for cell in line.split(",")]
-        inner = any(len(cell.split()) > 1 for cell in cells)
-        if inner and all(_is_number(word) for word in _WORD_BREAK.split(line) if word):
-            return None, False, True
-        return ",", False, False
-    if "\t" in line and not any(len(cell.split()) > 1 for cell in line.split("\t")):
-        return "\t", False, False
-    return None, False, False
-
-
-def _split(line: str, delimiter: str | None) -> list[str]:
-    if delimiter is None:
-        if '"' not in line:
-            return line.split()
-        return next(csv.reader([" ".join(line.split())], delimiter=" "), [])
-    cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
-    return [cell.strip() for cell in cells]
-
-
 def _finished(
     row: str,
     number: int,
@@ -204,9 +162,9 @@ def _finished(
 ) -> Layout:
     """The layout, once the first row of numbers is found."""
     row = _uncommented(row)
-    delimiter, decimal_comma, commas_are_blanks = _delimiter_of(row, separator)
+    delimiter, decimal_comma, commas_are_blanks = delimiter_of(row, separator)
     plain = row.replace(",", " ") if commas_are_blanks else row
-    cells = _split(plain, delimiter)
+    cells = split(plain, delimiter)
     trailing = len(cells) > 1 and cells[-1] == ""
     width = len(cells) - trailing
     notes: tuple[str, ...] = ()
@@ -215,62 +173,9 @@ def _finished(
     names: tuple[str, ...] | None = None
     skipped = 0
     if columns is None:
-        names, skipped, more = _names(comments, heads, delimiter, width)
+        names, skipped, more = names_of(comments, heads, delimiter, width)
         notes += more
     return Layout(
         names, delimiter, decimal_comma, commas_are_blanks, '"' in row, width, trailing, offset,
         number, count, skipped, notes,
     )  # fmt: skip
-
-
-def _names(
-    comments: list[str], heads: list[tuple[int, str]], delimiter: str | None, width: int
-) -> tuple[tuple[str, ...] | None, int, tuple[str, ...]]:
-    """Names for the columns, how many to skip in front of them, and notes."""
-    for number, line in heads:
-        cells = _best_split(line, delimiter, width)
-        if all(cell == "" or cell.isdecimal() for cell in cells):  # columns numbered by pandas
-            skipped = int(cells[0] == "")
-            return None, skipped, ("left out the index in front of the rows",) * skipped
-        if len(cells) == width + 1 and cells[-1] == "":
-            cells = cells[:-1]
-        if len(cells) == width - 1 and are_names(cells):
-            note = "there is one name less than columns: took the first column for an index"
-            return ("", *cells), 0, (note,)
-        try:
-            roles_of(cells)
-        except ValueError as error:
-            raise CloudFileError(f"line {number}: {error}") from None
-        if len(cells) != width:
-            raise CloudFileError(
-                f"line {number}: names {len(cells)} columns, the rows have {width}; {HOW_TO_SAY}"
-            )
-        return tuple(cells), 0, ()
-    for line in reversed(comments):
-        cells = _best_split(line, delimiter, width)
-        while len(cells) > width and cells[0].rstrip(":=").lower() in _PROSE:
-            cells = cells[1:]
-        if len(cells) == width and are_names(cells):
-            return tuple(cells), 0, ()
-        words = [word for word in _WORD_BREAK.split(line) if word]
-        bare = [word.strip(".:()[]\"'").lower() for word in words]
-        if not {"x", "y", "z"} <= set(bare):
-            continue
-        order = [bare.index(axis) for axis in "xyz"]
-        first = order[0] == 0 and order == sorted(order) and order[2] == 2
-        if (width == 3 and order == sorted(order)) or (first and len(cells) < width):
-            return None, 0, ()  # says what the columns are taken for anyway
-        raise CloudFileError(
-            f"a comment ({line!r:.60}) names {len(cells)} columns, the rows have {width}; "
-            f"{HOW_TO_SAY}"
-        )
-    return None, 0, ()
-
-
-def _best_split(line: str, delimiter: str | None, width: int) -> list[str]:
-    """Names may be separated otherwise than the numbers below them."""
-    tried = [_split(line, way) for way in (delimiter, ",", ";", "\t", None)]
-    if "(" in line or "[" in line:  # "x [m] y [m] z [m]" by blanks
-        tried.append(re.findall(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?", line))
-    fitting = [cells for cells in tried if len(cells) == width]
-    return next((cells for cells in fitting if are_names(cells)), (fitting or tried)[0])
