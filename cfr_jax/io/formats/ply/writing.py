@@ -72,9 +72,9 @@ def _vertices(table: Table, notes: list[str]) -> list[Column]:
             parts = [("n" + axis, values[:, i]) for i, axis in enumerate("xyz")]
         elif values.ndim > 1:
             parts = [(f"{name}_{i}", values[:, i]) for i in range(values.shape[1])]
-        elif not table.named and k in table.roles.points:
+        elif table.source != SOURCE and k in table.roles.points:
             parts = [("xyz"[table.roles.points.index(k)], values)]
-        elif not table.named and k in table.roles.normals:
+        elif table.source != SOURCE and k in table.roles.normals:
             parts = [("n" + "xyz"[table.roles.normals.index(k)], values)]
         else:
             parts = [("_".join(name.split()) or f"column_{k + 1}", values)]
