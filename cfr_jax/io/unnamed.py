@@ -9,7 +9,7 @@ import numpy as np
 from cfr_jax.io.cloud import UNIT_TOLERANCE, as_float64
 from cfr_jax.io.naming import HOW_TO_SAY, Roles
 
-# More numbers than this to a point are not seen; three long rows are a cloud on its side.
+# More numbers than this to a point are not seen; few long rows are a cloud on its side.
 _MOST_COLUMNS = 64
 # Fewer rows are in any order, and whole, by chance.
 _FEWEST_TO_JUDGE = 8
@@ -28,7 +28,7 @@ def roles_of_unnamed(columns: Sequence[np.ndarray]) -> tuple[Roles, tuple[str, .
         raise ValueError(
             f"wanted rows of x, y, z and perhaps more, got the shape ({rows}, {width})"
         )
-    if rows <= 6 and width > _MOST_COLUMNS:
+    if width > _MOST_COLUMNS or (rows <= 6 and width > 4 * rows > 0 and width > 8):
         raise ValueError(
             f"got the shape ({rows}, {width}), wanted a row for each point: is it transposed (.T)?"
         )

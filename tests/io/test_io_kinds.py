@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from io_samples import normals, points, surface
-from kind_samples import all_kinds, npz, solids
+from kind_samples import all_kinds, npy, npz, solids
 from text_samples import LINES, ROWS, XYZ
 
 from cfr_jax.io import CloudFileError, CloudWarning, read
@@ -93,6 +93,9 @@ REFUSED = {
     "decimal commas as separators": ("a.csv", ["x,y,z", "1,5,2,5,3,5"], "names 3 .* have 6"),
     "two clouds": ("a.npz", npz(src=XYZ, ref=XYZ), "wanted an array 'points'.* got 'ref', 'src'"),
     "three floats a row": ("a.bin", XYZ.astype("<f4").tobytes(), "no rows of 16 as in KITTI"),
+    "a picture": ("a.npy", npy(np.zeros((6, 10, 3), np.uint8)), "an image"),
+    "a cloud on its side": ("a.npy", npy(XYZ[:20].T.copy()), "transposed"),
+    "planes of a grid": ("a.npy", npy(np.ones((3, 6, 100))), "transposed"),
     "a PTX cut off": ("a.ptx", ["2", "1", "0 0 0", "1 0 0"], "line 5: .* within the header"),
 }  # fmt: skip
 

@@ -11,6 +11,7 @@ import numpy as np
 from cfr_jax.io.budget import check_room
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.mesh import Mesh
+from cfr_jax.io.naming import HOW_TO_SAY
 from cfr_jax.io.table import Table, table_of, unnamed_table
 
 _DESCR = re.compile(r"""['"]descr['"]\s*:\s*(['"][<>|=]?[A-Za-z]\w*['"]|\[[^\]]*\])""")
@@ -40,6 +41,8 @@ def table_of_array(
         raise CloudFileError(f"holds {array.dtype}, wanted floats or integers")
     if not array.dtype.names and array.ndim not in (2, 3):
         raise CloudFileError(f"the shape is {array.shape}, wanted (n, 3) or (n, 6)")
+    if array.ndim == 3 and array.dtype == np.uint8 and columns is None:
+        raise CloudFileError(f"is {array.shape} of bytes, an image? {HOW_TO_SAY}")
     rows = array.size if array.dtype.names else array.size // max(array.shape[-1], 1)
     check_room(rows, 24, size, f"points of {array.dtype}")
     if array.dtype.names:

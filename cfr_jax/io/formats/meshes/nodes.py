@@ -12,7 +12,7 @@ from cfr_jax.io.cloud import CloudFileError
 T = TypeVar("T")
 
 
-def placement(node: dict) -> Float64[np.ndarray, "4 4"]:
+def placement(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
     """A node's transform, of its own frame into the one above."""
     if "matrix" in node:
         return _numbers(node, "matrix", [0.0] * 16).reshape(4, 4).T  # stored by columns
@@ -30,7 +30,7 @@ def placement(node: dict) -> Float64[np.ndarray, "4 4"]:
     return placed
 
 
-def _numbers(node: dict, key: str, default: list[float]) -> Float64[np.ndarray, " k"]:
+def _numbers(node: dict[str, Any], key: str, default: list[float]) -> Float64[np.ndarray, " k"]:
     values = get(node, key, list, default)
     good = all(type(v) in (int, float) and abs(v) <= 1e15 for v in values)
     if not good or len(values) != len(default):
