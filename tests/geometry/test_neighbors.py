@@ -1,6 +1,7 @@
 """All searches find the same sets as the plain one, including ties and duplicates."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -187,3 +188,14 @@ def test_an_accelerator_searches_without_a_loop(platform, most):
             text = jax.jit(program).trace(given).lower(lowering_platforms=(platform,)).as_text()
             loops = text.count("stablehlo.while")
             assert loops == 0 if most == 0 else 0 < loops <= most
+
+
+@pytest.mark.parametrize(("n", "most"), [(500, 500), (12_000, 12_000 / 6.5)])
+def test_an_accelerator_sorts_small_clouds_once_and_of_large_ones_a_seventh(n, most):
+    points = jax.ShapeDtypeStruct((n, 3), jnp.float32)
+
+    program = jax.jit(lambda x: nearest(x, 64)).trace(points)
+
+    text = program.lower(lowering_platforms=("cuda",)).as_text()
+    rows = [int(width) for width in re.findall(r"top_k.*tensor<\d+x(\d+)xf32>\)? ->", text)]
+    assert len(rows) == (1 if n == 500 else 2) and sum(rows) <= most
