@@ -199,3 +199,15 @@ def test_an_accelerator_sorts_small_clouds_once_and_of_large_ones_a_seventh(n, m
     text = program.lower(lowering_platforms=("cuda",)).as_text()
     rows = [int(width) for width in re.findall(r"top_k.*tensor<\d+x(\d+)xf32>\)? ->", text)]
     assert len(rows) == (1 if n == 500 else 2) and sum(rows) <= most
+
+
+@pytest.mark.parametrize("k", [1, 12, 30, 100])  # groups of eight, four, two, and points alone
+def test_a_block_of_rows_sorts_no_more_values_than_it_may(k):
+    points, entries = jax.ShapeDtypeStruct((125, 3), jnp.float32), 2500
+    search = functools.partial(neighbors._nearest_by_groups, few=8, entries=entries)
+
+    text = jax.jit(lambda x: search(x, None, k, np.inf)).trace(points).lower().as_text()
+
+    sizes = re.findall(r"top_k.*tensor<(\d+)x(\d+)xf32>\)? ->", text)
+    rows, widths = int(sizes[0][0]), [int(width) for _, width in sizes]
+    assert rows < 125 and (rows - 1) * sum(widths) <= entries
