@@ -37,7 +37,7 @@ class Frames:
     scale: float
     initial: Float[np.ndarray, "4 4"]
     """Applied to the caller's source before it is centered."""
-    size_ratio: float = 1.0
+    size_ratio: float
     """Radius of the source divided by the radius of the target."""
 
     def to_caller(self, transforms: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
