@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import jax
@@ -33,6 +34,12 @@ def test_it_has_no_leaves_and_survives_what_is_done_to_parameters():
     assert jax.device_get(TREE)[KEY] == FITTED
     assert calibration_of(TREE) is FITTED and calibration_of({}) is None
     assert uncalibrated(TREE).keys() == {"kernel"} and KEY in TREE
+
+
+def test_it_cannot_be_changed_under_a_compiled_program():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        FITTED.register = ()
+    assert hash(FITTED) == hash(Calibration.read(FITTED.write()))
 
 
 def test_gradients_and_optimizers_pass_it_by():
