@@ -69,3 +69,13 @@ def test_an_unknown_point_pair_feature_is_refused(unchecked):
 
     with pytest.raises(ValueError, match="^ppf: got 'cosine'"):
         raw_features(points, normals, neighbors, ppf="cosine")
+
+
+def test_with_position_a_points_own_coordinates_come_first():
+    points, normals, neighbors = (jnp.asarray(a) for a in cloud(4))
+
+    found = raw_features(points, normals, neighbors, position=True)
+
+    assert found.shape == (12, 4, 10)
+    np.testing.assert_array_equal(found[..., :3], jnp.broadcast_to(points[:, None], (12, 4, 3)))
+    np.testing.assert_array_equal(found[..., 3:], raw_features(points, normals, neighbors))
