@@ -64,11 +64,12 @@ def test_gradients_are_finite_for_duplicates_and_parallel_or_missing_normals(ppf
         assert np.isfinite(gradient).all()
 
 
-def test_an_unknown_point_pair_feature_is_refused(unchecked):
+@pytest.mark.parametrize("name", ["cosine", "none"])
+def test_an_unknown_point_pair_feature_is_refused(unchecked, name):
     points, normals, neighbors = (jnp.asarray(a) for a in cloud())
 
-    with pytest.raises(ValueError, match="^ppf: got 'cosine'"):
-        raw_features(points, normals, neighbors, ppf="cosine")
+    with pytest.raises(ValueError, match=f"^ppf: got '{name}'"):
+        raw_features(points, normals, neighbors, ppf=name)
 
 
 def test_with_position_a_points_own_coordinates_come_first():
