@@ -155,10 +155,28 @@ def test_a_batch_is_searched_like_single_clouds():
 def test_an_impossible_k_is_refused(k):
     points = np.zeros((5, 3), np.float32)
 
-    with pytest.raises(ValueError, match=rf"^k: got {k} neighbors for a cloud of 5 points"):
+    told = rf"^k: got {k} neighbors for a cloud of 5 points, wanted 1 <= k <= 4$"
+    with pytest.raises(ValueError, match=told):
         nearest(jnp.asarray(points), k)
-    with pytest.raises(ValueError, match=rf"^k: got {k} neighbors for a cloud of 5 points"):
+    with pytest.raises(ValueError, match=told):
         nearest_on_host(points, k)
+
+
+def test_a_large_cloud_on_the_host_is_searched_like_a_small_one():
+    points = np.random.default_rng(8).normal(size=(1600, 3)).astype(np.float32)
+
+    np.testing.assert_array_equal(
+        sets(nearest_on_host(points, 5)), sets(pieces.nearest_neighbors(points, 5))
+    )
+
+
+def test_on_a_cpu_memory_grows_with_the_cloud_and_not_with_its_square():
+    n = 8000
+    points = jax.ShapeDtypeStruct((n, 3), jnp.float32)
+
+    for search in (lambda x: nearest(x, 16), lambda x: first_in_ball(x, 16, 0.3)):
+        compiled = jax.jit(search).lower(points).compile()
+        assert compiled.memory_analysis().temp_size_in_bytes < 4 * n * n / 20
 
 
 @pytest.mark.parametrize("search", IN_BALL)

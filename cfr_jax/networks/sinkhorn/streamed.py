@@ -68,8 +68,7 @@ def forward(
             u = 1 / jnp.maximum(sums, tiny)
             return found + jnp.matmul(u, block, precision=_HIGHEST), (u, shift)
 
-        given: tuple = (blocks.rows,) if shift is None else (blocks.rows, shift)
-        found, (u, shift) = lax.scan(rows, jnp.zeros(m, v.dtype), given)
+        found, (u, shift) = lax.scan(rows, jnp.zeros(m, v.dtype), (blocks.rows, shift))
         return 1 / (found + 1), (u, v, found), shift
 
     # The shift of a row is its largest entry. It is the same in every pass; the first one finds it.
