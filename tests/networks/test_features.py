@@ -32,6 +32,16 @@ def test_offsets_come_before_the_point_pair_feature(ppf, wanted):
 
 
 @pytest.mark.parametrize("ppf", ["dot", "angle"])
+def test_a_duplicate_of_a_point_lies_nowhere_from_it(ppf):
+    points, normals, neighbors = (jnp.asarray(a) for a in cloud())
+
+    found = features(jnp.tile(points[:1], (12, 1)), normals, neighbors, ppf=ppf)
+
+    there = [0, 1, 2, 3, 4, 6]  # the offset, its directions to both normals, its length
+    assert not found[..., jnp.array(there)].any() and found[..., 5].all()
+
+
+@pytest.mark.parametrize("ppf", ["dot", "angle"])
 def test_gradients_are_their_finite_differences(x64, ppf):
     points, normals, neighbors = (jnp.asarray(a) for a in cloud(1))
     rng = np.random.default_rng(2)
