@@ -98,3 +98,9 @@ def test_the_first_point_of_each_voxel_is_found(voxel):
     for row, point in enumerate(points):
         first.setdefault(tuple(round(axis) for axis in point / voxel), row)
     assert sorted(found) == sorted(first.values())
+
+
+def test_every_point_of_a_lattice_has_a_voxel_of_its_own():
+    points = np.stack(np.meshgrid(*map(np.arange, (4, 5, 6))), -1).reshape(-1, 3).astype(float)
+
+    assert sorted(units._first_of_each_voxel(points, 1.0)) == list(range(120))
