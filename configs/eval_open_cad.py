@@ -48,6 +48,7 @@ def exact() -> dict[str, MethodEntry]:
         # as published; rpmnet_optim has the paper's speed-ups, and gives the same answers
         "rpmnet": network("rpmnet", {"settings": {"optimized": False}}, modules=True),
         "rpmnet_optim": network("rpmnet", modules=True),
+        **peers(),
     }
 
 
@@ -66,6 +67,18 @@ def estimated() -> dict[str, MethodEntry]:
 # For clouds of about 700 points in the unit sphere; lengths are in its radius. Methods have one
 # thread where several would race, for random numbers or for the order of a sum.
 _LOCAL = {"distances": (0.2, 0.1, 0.05), "start": "centroid"}
+
+
+def peers() -> dict[str, MethodEntry]:
+    """The other learned methods of the paper's table, which take no normals. Weights are those that
+    `dcp.py`, `fmr.py` and `rgm.py` train, or those of `cfr convert`; left out where there are none.
+    """
+    return {
+        "dcp": network("dcp", weights="dcp", modules=True),
+        "fmr": network("fmr", weights="fmr", modules=True),
+        # of reduced width (`rgm.py`), and four times through the network all the same
+        "rgm": network("rgm", weights="rgm", modules=True),
+    }
 
 
 def by_features(radius: float) -> dict[str, MethodEntry]:

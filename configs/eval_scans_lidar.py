@@ -56,4 +56,6 @@ def methods() -> dict[str, MethodEntry]:
         "rpmnet": MethodEntry("rpmnet", prepared | {"settings": {"optimized": False}}),
         "rpmnet_optim": MethodEntry("rpmnet", prepared),
         "rpmnet_optim_estimated": MethodEntry("rpmnet", prepared, estimated_normals=True),
+        # of clouds whose pairs of points are too many to be stored, DCP and RGM say so
+        **{name: MethodEntry(name, prepared, weights=name) for name in ("dcp", "fmr", "rgm")},
     }

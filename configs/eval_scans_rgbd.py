@@ -46,4 +46,6 @@ def methods() -> dict[str, MethodEntry]:
         "cfr_align": MethodEntry("cfr", network | {"refine": True}),
         "rpmnet": MethodEntry("rpmnet", prepared | {"settings": {"optimized": False}}),
         "rpmnet_optim": MethodEntry("rpmnet", prepared),
+        # of clouds whose pairs of points are too many to be stored, DCP and RGM say so
+        **{name: MethodEntry(name, prepared, weights=name) for name in ("dcp", "fmr", "rgm")},
     }

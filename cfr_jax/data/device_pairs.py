@@ -21,7 +21,7 @@ from flax import struct
 from jax import random
 from jaxtyping import Array, Bool, Float, Float16, Int8, Int32, Key, UInt32
 
-from cfr_jax.data.augment import SENSOR_AWAY, Sampling
+from cfr_jax.data.augment import SENSOR_AWAY, Sampling, shared_count
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.protocol import NOISE_CLIP, NOISE_SCALE
 from cfr_jax.geometry import neighbors, rigid
@@ -103,6 +103,10 @@ def draw_pair(
     length = jnp.sqrt(jnp.sum(normals * normals, axis=1, keepdims=True))
     normals = normals / jnp.maximum(length, 1)
     of_pair, of_sides = random.split(key)
+    if sampling.copied:
+        score = random.uniform(random.fold_in(of_pair, 1), (len(points),))
+        rows = jnp.argsort(score)[: shared_count(sampling, len(points))]
+        points, normals = points[rows], normals[rows]
     drawn = _decide(of_pair, sampling)
 
     def cloud(key: Array, placed: Array) -> tuple[Array, Array, Array]:
@@ -233,7 +237,7 @@ def _crop(
     below = jnp.clip(jnp.floor(place), 0, count - 2)
     ordered, row = jnp.sort(height), below.astype(jnp.int32)
     plane = ordered[row] + (ordered[row + 1] - ordered[row]) * (place - below)
-    return height > jnp.where(keep == 0.5, 0, plane)
+    return (height > jnp.where(keep == 0.5, 0, plane)) | (keep >= 1)
 
 
 def _add_noise(

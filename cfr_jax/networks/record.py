@@ -29,9 +29,29 @@ class Step(NamedTuple):
 Params: TypeAlias = dict[str, Any]
 """The parameters of a network: a pytree of float32 arrays, named by the keys of nested dicts."""
 
+
+class Motion(NamedTuple):
+    """What one iteration found, for a network that `training.losses.pair_loss` does not train."""
+
+    transform: Float[Array, "4 4"]
+    """From the source as given onto the target."""
+
+
+class Goal(NamedTuple):
+    """What a network with its own loss makes of a training pair."""
+
+    loss: Float[Array, ""]
+    transforms: Float[Array, "L 4 4"]
+    """What it found meanwhile, for the reports; from the source as given onto the target."""
+
+
 # Each network has its own type of settings, so here it is `Any`.
-Unroll = Callable[[Params, Cloud, Cloud, Any], Iterable[Step]]
-"""The iterations of a network: from parameters, source, target and settings to one `Step` each."""
+Unroll = Callable[[Params, Cloud, Cloud, Any], Iterable[Step | Motion]]
+"""The iterations of a network: from parameters, source, target and settings to one `Step` each, or
+one `Motion` if the network has an objective."""
+Objective = Callable[[Params, Cloud, Cloud, Float[Array, "4 4"], Any], Goal]
+"""The loss of a network, from parameters, source, target, true motion and settings. It is called
+inside a `vmap` over all or some pairs of a step, whose axis is `peers.batch_norm.PAIRS`."""
 
 
 class Part(NamedTuple):
@@ -74,10 +94,13 @@ class Checkpoint:
 
     recognizes: Callable[[Collection[str]], bool]
     """Whether tensors with these names are such a checkpoint."""
-    arguments: Callable[[Collection[str]], dict[str, Any]]
-    """Arguments of `Network.fresh` that make parameters of the same kind."""
-    places: Callable[[Collection[str]], dict[str, Place]]
+    arguments: Callable[[Mapping[str, Any]], dict[str, Any]]
+    """Arguments of `Network.fresh` that make parameters of the same kind, from the tensors by name.
+    """
+    places: Callable[[Mapping[str, Any]], dict[str, Place]]
     """The place of every tensor that the checkpoint must have."""
+    passed_over: tuple[str, ...] = ()
+    """Ends of the names of tensors that may be there and are not needed: counters, constants."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,5 +143,7 @@ class Network:
     """Whether it searches its neighbors itself and ignores those of a prepared cloud."""
     parts: Callable[[Params, Any], Callable[[Cloud, Cloud], Iterator[Part]]] | None = None
     """From parameters and settings to a function that yields the parts of a registration."""
+    objective: Objective | None = None
+    """What a training minimizes; None for the loss of CFR, `training.losses.pair_loss`."""
     checkpoint: Checkpoint | None = None
     """How `cfr convert` reads published checkpoints; None if it reads none."""

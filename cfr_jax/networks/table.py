@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 _BUILT_IN = {
     "cfr": "cfr_jax.networks.cfr.network",
     "rpmnet": "cfr_jax.networks.rpmnet",
+    "dcp": "cfr_jax.networks.peers.dcp",
+    "fmr": "cfr_jax.networks.peers.fmr",
+    "rgm": "cfr_jax.networks.peers.rgm",
 }
 _registered: dict[str, Network] = {}
 

@@ -62,6 +62,7 @@ class SamplingSection:
     sensor_noise: float = 0.0  # share of pairs with noise along a depth sensor's rays instead
     sensor_scale: Range = Sampling.sensor_scale  # standard deviation at the middle of the cloud
     estimated_normals: float = 0.4  # share of pairs; users' clouds rarely have exact normals
+    copied: bool = Sampling.copied  # make both clouds from the same points of the shape
 
     def __post_init__(self) -> None:
         check_types(self, "sampling.")
@@ -101,6 +102,8 @@ class TrainSection:
     peak_rate: float = 1e-3
     warmup: float = 0.1  # share of all steps
     cooldown: float = 0.2  # share of all steps; only for "wsd" and "trapezoid"
+    drops: tuple[float, ...] = ()  # shares of all steps after which the rate drops; for "stairs"
+    drop_factor: float = 0.1  # what a drop multiplies the rate by
     clip: float = 1.0  # largest norm of the whole gradient
     weight_decay: float = 1e-5
     correspondence_weight: float = 0.05  # weight of the correspondence loss; the pose has 1
@@ -136,6 +139,8 @@ class TrainingConfig:
     network: str = "cfr"  # a name in `networks.table`
     iterations: int = 5
     shared: bool = False  # one light layer for all iterations, instead of one for each
+    width: int = 0  # channels of the features of DCP and RGM; 0: as published
+    version: str = ""  # "v1" or "v2", for DCP
     settings: dict[str, Any] = field(default_factory=dict)
     """Settings of the network that differ from its usual ones; for CFR, fields of
     `networks.inputs.Settings`."""
@@ -199,11 +204,11 @@ def _check_length(train: TrainSection, phases: tuple[Phase, ...]) -> None:
             f"steps_at_once, minutes: got {train.steps_at_once} and {train.minutes}, wanted 1 and "
             '0, because train.draw is "host"; train.draw="device" allows other values'
         )
-    if train.minutes and (len(phases) > 1 or train.schedule != "trapezoid"):
+    if train.minutes and (len(phases) > 1 or train.schedule not in ("trapezoid", "stairs")):
         raise ValueError(
             f"minutes: got {train.minutes} for {len(phases)} phases and schedule "
             f"{train.schedule!r}, wanted one phase (its steps follow from the time) and "
-            "'trapezoid'"
+            "'trapezoid' or 'stairs'"
         )
     if train.minutes:
         return

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 
 from cfr_jax.networks import table
-from cfr_jax.networks.record import Network, Unroll
+from cfr_jax.networks.record import Network, Objective, Unroll
 from cfr_jax.training.config import Phase, TrainingConfig
 
 
@@ -23,6 +23,8 @@ class Learner:
     trained: Callable[[int], Any]
     """From the number of neighbors to the settings for training."""
     validated: Any
+    objective: Objective | None
+    """What is minimized instead of `losses.pair_loss`."""
 
 
 def learner(config: TrainingConfig) -> Learner:
@@ -45,6 +47,7 @@ def learner(config: TrainingConfig) -> Learner:
             record.trained(count, config.iterations), **of_training
         ),
         validated=dataclasses.replace(record.validated, **changed),
+        objective=record.objective,
     )
 
 

@@ -207,6 +207,7 @@ class _Training:
             pairs_at_once=config.train.pairs_at_once,
             precision=config.train.precision,
             max_skipped=config.train.max_skipped,
+            objective=task.learner.objective,
         )
         return Leg(phase, task.samplings[task.phases.index(phase)], recipe)
 

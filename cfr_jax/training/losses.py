@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from cfr_jax.geometry import rigid
 from cfr_jax.networks.inputs import Cloud
-from cfr_jax.networks.record import Step
+from cfr_jax.networks.record import Goal, Motion, Step
 
 _DISCOUNT = 0.5  # the last iteration counts fully, each earlier one half as much as the next
 _INLIER_WEIGHT = 0.01
@@ -32,11 +32,12 @@ class PairLoss:
     """Degrees, per iteration."""
     translation_error: Float[Array, " L"]
     beta: Float[Array, " L"]
+    """Of the annealing, as alpha; zero for a network that has none."""
     alpha: Float[Array, " L"]
 
 
 def pair_loss(
-    steps: Iterable[Step],
+    steps: Iterable[Step | Motion],
     source: Cloud,
     target: Cloud,
     truth: Float[Array, "4 4"],
@@ -48,27 +49,47 @@ def pair_loss(
     Pose: the mean of |T_i x - T_truth x| over points and axes, plus 0.01 times the mean slack of
     both clouds, discounted by 0.5 for each iteration before the last. Correspondence: see
     `correspondence_loss`, with the same discount. It stores the affinities, whatever the form of
-    the match. `truth` maps source onto target.
+    the match. `truth` maps source onto target. Raises ValueError for steps without correspondences.
     """
-    steps = list(steps)
+    matched = [_matched(step) for step in steps]
     there = rigid.apply(truth, source.points)
     spread = _squared_distances(there, target.points)
     pose = correspondence = jnp.zeros((), there.dtype)
-    for i, step in enumerate(steps):
-        discount = _DISCOUNT ** (len(steps) - 1 - i)
+    for i, step in enumerate(matched):
+        discount = _DISCOUNT ** (len(matched) - 1 - i)
         pose += discount * _pose_term(step, source.points, there)
         if correspondence_weight:
             correspondence += discount * correspondence_loss(step.affinity.log(), spread)
-    transforms = jnp.stack([step.transform for step in steps])
+    transforms = jnp.stack([step.transform for step in matched])
     return PairLoss(
         total=pose + correspondence_weight * correspondence,
         pose=pose,
         correspondence=correspondence,
         rotation_error=jax.vmap(rigid.rotation_error, (0, None))(transforms, truth),
         translation_error=jax.vmap(rigid.translation_error, (0, None))(transforms, truth),
-        beta=jnp.stack([step.affinity.beta for step in steps]),
-        alpha=jnp.stack([step.affinity.alpha for step in steps]),
+        beta=jnp.stack([step.affinity.beta for step in matched]),
+        alpha=jnp.stack([step.affinity.alpha for step in matched]),
     )
+
+
+def goal_loss(goal: Goal, truth: Float[Array, "4 4"]) -> PairLoss:
+    """What a network with an objective of its own made of a pair, in the same words."""
+    nothing = jnp.zeros(len(goal.transforms), goal.loss.dtype)
+    return PairLoss(
+        total=goal.loss,
+        pose=goal.loss,
+        correspondence=jnp.zeros_like(goal.loss),
+        rotation_error=jax.vmap(rigid.rotation_error, (0, None))(goal.transforms, truth),
+        translation_error=jax.vmap(rigid.translation_error, (0, None))(goal.transforms, truth),
+        beta=nothing,
+        alpha=nothing,
+    )
+
+
+def _matched(step: Step | Motion) -> Step:
+    if isinstance(step, Motion):
+        raise ValueError("steps: got motions alone, wanted correspondences, or an objective")
+    return step
 
 
 def _pose_term(step: Step, points: Array, there: Array) -> Array:

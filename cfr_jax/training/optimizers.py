@@ -12,7 +12,9 @@ import optax.contrib
 from jax.typing import ArrayLike
 from jaxtyping import Array, Int, PyTree
 
-SCHEDULES = ("cosine", "wsd", "constant", "trapezoid")
+from cfr_jax.networks.peers.batch_norm import MOMENTUM, is_running
+
+SCHEDULES = ("cosine", "wsd", "constant", "trapezoid", "stairs")
 OPTIMIZERS = ("adamw", "adam", "lion", "sgd", "muon")
 
 # "muon" orthogonalizes matrices whose smaller side is in this range. Smaller ones are inputs and
@@ -46,6 +48,27 @@ class Trapezoid:
         return self.peak_rate * jnp.clip(jnp.minimum(risen, left), 0, 1)
 
 
+@dataclasses.dataclass(frozen=True)
+class Stairs:
+    """A rate that becomes `factor` of itself at each of the `drops`, shares of all steps; planned
+    as a `Trapezoid`."""
+
+    peak_rate: float
+    steps: int
+    drops: tuple[float, ...]
+    factor: float
+
+    def __call__(self, count: ArrayLike) -> Array:
+        """The rate of step `count`, from 0."""
+        return self.at(count, self.steps)
+
+    def at(self, count: ArrayLike, steps: ArrayLike) -> Array:
+        """The same in a training of so many steps."""
+        done, steps = jnp.asarray(count, jnp.float32), jnp.asarray(steps, jnp.float32)
+        fallen = sum((done >= drop * steps).astype(jnp.float32) for drop in self.drops)
+        return self.peak_rate * jnp.float32(self.factor) ** fallen
+
+
 class Planned(NamedTuple):
     """The current step of an optimizer, and the number of steps of its training."""
 
@@ -56,21 +79,29 @@ class Planned(NamedTuple):
 
 def planned(state: optax.OptState, steps: Int[Array, ""]) -> optax.OptState:
     """An optimizer's state for a training of `steps` steps; unchanged unless its schedule is a
-    `Trapezoid`."""
+    `Trapezoid` or `Stairs`."""
     if optax.tree.get(state, "planned_steps") is None:
         return state
     return optax.tree.set(state, planned_steps=steps)
 
 
 def make_schedule(
-    kind: str, *, peak_rate: float, steps: int, warmup: float, cooldown: float = 0.2
+    kind: str,
+    *,
+    peak_rate: float,
+    steps: int,
+    warmup: float,
+    cooldown: float = 0.2,
+    drops: tuple[float, ...] = (),
+    factor: float = 0.1,
 ) -> optax.Schedule:
     """The learning rate over `steps` steps; `warmup` and `cooldown` are shares of them.
 
     "cosine", "wsd" and "constant" start at a 25th of the peak and rise during the warmup. Then
     "cosine" falls along half a wave to a thousandth of the peak. "wsd" (warmup, stable, decay)
     stays at the peak until the cooldown and falls linearly to a thousandth, so that a run can be
-    extended without starting over. "constant" stays at the peak. "trapezoid" is a `Trapezoid`.
+    extended without starting over. "constant" stays at the peak. "trapezoid" is a `Trapezoid`,
+    "stairs" is `Stairs`.
     Raises ValueError for an unknown name and for numbers that cannot be used.
     """
     if not steps > 0 or not peak_rate > 0:
@@ -82,6 +113,13 @@ def make_schedule(
         )
     if kind == "trapezoid":
         return Trapezoid(peak_rate, steps, warmup, cooldown)
+    if kind == "stairs":
+        if not (all(0 < drop < 1 for drop in drops) and 0 < factor <= 1):
+            raise ValueError(
+                f"schedule: got drops {drops} to {factor}, wanted shares of all steps, and of the "
+                "rate"
+            )
+        return Stairs(peak_rate, steps, drops, factor)
     rising = max(1, int(warmup * steps))
     start, end = peak_rate / 25, peak_rate / 1000
     if kind == "cosine":
@@ -108,7 +146,7 @@ def make_optimizer(
     Nesterov momentum. "adam" adds `weight_decay` times the weights to the gradient first, as the
     published trainings did. Raises ValueError for an unknown name.
     """
-    if isinstance(schedule, Trapezoid):
+    if isinstance(schedule, Trapezoid | Stairs):
         return optax.chain(
             make_optimizer(kind, _one, clip=clip, weight_decay=weight_decay),
             _scaled_by(schedule),
@@ -142,7 +180,19 @@ def _one(count: ArrayLike) -> Array:
     return jnp.ones((), jnp.float32)
 
 
-def _scaled_by(schedule: Trapezoid) -> optax.GradientTransformation:
+def keep_running(optimizer: optax.GradientTransformation) -> optax.GradientTransformation:
+    """The optimizer for all but the running statistics of batch norms (`peers.batch_norm`), which
+    follow those of the batches: by gradient descent at the published rate."""
+
+    def kinds(params: PyTree) -> PyTree:
+        return jax.tree.map_with_path(
+            lambda path, _: "running" if is_running(path) else "learned", params
+        )
+
+    return optax.partition({"learned": optimizer, "running": optax.sgd(MOMENTUM)}, kinds)
+
+
+def _scaled_by(schedule: Trapezoid | Stairs) -> optax.GradientTransformation:
     def init(params: PyTree) -> Planned:
         return Planned(jnp.zeros((), jnp.int32), jnp.asarray(schedule.steps, jnp.int32))
 

@@ -18,9 +18,10 @@ from cfr_jax.data.augment import Sampling
 from cfr_jax.data.device_pairs import Shapes, draw_pairs
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks.inputs import Cloud
-from cfr_jax.networks.record import Params, Unroll
+from cfr_jax.networks.peers.batch_norm import PAIRS
+from cfr_jax.networks.record import Objective, Params, Unroll
 from cfr_jax.training.devices import AXIS
-from cfr_jax.training.losses import PairLoss, pair_loss
+from cfr_jax.training.losses import PairLoss, goal_loss, pair_loss
 
 PRECISIONS = ("float32", "tensorfloat32", "bfloat16")
 # The precision of the products in learned layers, that is, of all products whose precision is not
@@ -59,6 +60,8 @@ class Recipe:
     precision: str
     max_skipped: int
     """How many steps in a row may be skipped; after more than these, nothing changes anymore."""
+    objective: Objective | None = None
+    """What is minimized instead of `pair_loss`."""
 
 
 def init_state(params: Params, optimizer: optax.GradientTransformation) -> TrainState:
@@ -165,6 +168,10 @@ def _mean_gradient(
 
     def loss(params: Params, pair: dict[str, Array]) -> tuple[Array, PairLoss]:
         source, target = (_cloud(pair, side) for side in ("source", "target"))
+        if recipe.objective is not None:
+            goal = recipe.objective(params, source, target, pair["transform"], recipe.settings)
+            measured = goal_loss(goal, pair["transform"])
+            return measured.total, measured
         measured = pair_loss(
             recipe.unroll(params, source, target, recipe.settings),
             source,
@@ -179,11 +186,12 @@ def _mean_gradient(
     at_once = min(recipe.pairs_at_once, size)
 
     def add(total: Params, pairs: dict[str, Array]) -> tuple[Params, PairLoss]:
-        if at_once == 1:  # with a batch axis of length one, XLA would choose slower products
+        # with a batch axis of length one, XLA would choose slower products
+        if at_once == 1 and recipe.objective is None:
             gradient, measured = gradient_of(params, jax.tree.map(lambda leaf: leaf[0], pairs))
             measured = jax.tree.map(lambda leaf: leaf[None], measured)
         else:
-            gradient, measured = jax.vmap(gradient_of, (None, 0))(params, pairs)
+            gradient, measured = jax.vmap(gradient_of, (None, 0), axis_name=PAIRS)(params, pairs)
             gradient = jax.tree.map(lambda leaf: leaf.sum(0), gradient)
         return jax.tree.map(jnp.add, total, gradient), measured
 

@@ -79,6 +79,8 @@ def prepare(config: TrainingConfig, workdir: Path) -> Task:
         steps=1 if config.train.minutes else sum(phase.steps for phase in config.phases),
         warmup=config.train.warmup,
         cooldown=config.train.cooldown,
+        drops=config.train.drops,
+        factor=config.train.drop_factor,
     )
     optimizer = optimizers.make_optimizer(
         config.train.optimizer,
@@ -86,6 +88,8 @@ def prepare(config: TrainingConfig, workdir: Path) -> Task:
         clip=config.train.clip,
         weight_decay=config.train.weight_decay,
     )
+    if chosen.objective is not None:
+        optimizer = optimizers.keep_running(optimizer)
     mixture = open_mixture(config.data.train, workdir, "data.train")
     held_out = open_mixture(config.data.validation, workdir, "data.validation")
     check_apart(mixture, held_out)

@@ -24,11 +24,11 @@ from cfr_jax.networks.record import Checkpoint, Network, Params
 
 
 def convert(path: str | Path) -> Params:
-    """Parameters from a checkpoint by a network's authors, such as CFR or RPM-Net.
+    """Parameters from a checkpoint by a network's authors: CFR, RPM-Net, DCP, FMR or RGM.
 
     The names of the tensors decide which network it is; `weights.files.network_of` tells it from
-    the result. `path` is a PyTorch file (.pth or .pt; needs torch, which reads only tensors and
-    unpickles no objects), or a .safetensors or .npz file with the same tensors under the same
+    the result. `path` is a PyTorch file (.pth, .pt or .t7; needs torch, which reads only tensors
+    and unpickles no objects), or a .safetensors or .npz file with the same tensors under the same
     names. For CFR, all iterations in the file are kept. Raises ValueError, naming every tensor that
     is missing, unknown, of the wrong shape, or not finite.
     """
@@ -38,6 +38,7 @@ def convert(path: str | Path) -> Params:
     readers: dict[str, Callable[[Path], dict[str, np.ndarray]]] = {
         ".pth": _read_torch,
         ".pt": _read_torch,
+        ".t7": _read_torch,
         ".safetensors": lambda path: load_file(path),
         ".npz": _read_npz,
     }
@@ -62,7 +63,11 @@ def from_state_dict(state: dict[str, np.ndarray], name: str = "state_dict") -> P
     ours = jax.eval_shape(fresh, jax.random.key(0))
     shapes = {key: leaf.shape for key, leaf in flatten_dict(ours, sep="/").items()}
     faults = [f"{theirs} is missing" for theirs in places if theirs not in state]
-    faults += [f"{theirs} is unknown" for theirs in state if theirs not in places]
+    faults += [
+        f"{theirs} is unknown"
+        for theirs in state
+        if theirs not in places and not theirs.endswith(checkpoint.passed_over)
+    ]
     found: dict[str, list[np.ndarray]] = {}
     for theirs, place in places.items():
         if theirs not in state:

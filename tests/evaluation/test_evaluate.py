@@ -140,7 +140,7 @@ def test_without_normals_the_methods_are_the_same_and_none_is_given_any():
     exact, estimated = (config.get_config(kind).methods for kind in ("exact", "estimated"))
 
     # all but those that take no normals, and RPM-Net, whose answers are those of `rpmnet_optim`
-    without = {"identity", "truth", "icp", "gicp", "kiss_matcher", "rpmnet"}
+    without = {"identity", "truth", "icp", "gicp", "kiss_matcher", "rpmnet", "dcp", "fmr", "rgm"}
     assert set(estimated) == {f"{name}_estimated" for name in set(exact) - without}
     for name, entry in estimated.items():
         assert entry.estimated_normals is True

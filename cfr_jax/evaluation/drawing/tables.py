@@ -84,7 +84,7 @@ def _errors(
         ]
         for tell in (_value, _interval)
     )
-    failed = [str(len(m.failures)) for m in measured]
+    failed = [_failed(m) for m in measured]
     return [
         *_grid([*header, "failed"], [[*row, n] for row, n in zip(values, failed, strict=True)]),
         "",
@@ -92,6 +92,14 @@ def _errors(
         "",
         *_grid(header, intervals),
     ]
+
+
+def _failed(m: Measured) -> str:
+    """How many failed; why, where it was all of them, for one reason."""
+    reasons = set(m.failures.values())
+    if len(reasons) == 1 and not m.answered.any():
+        return f"{len(m.failures)}: {reasons.pop()}"
+    return str(len(m.failures))
 
 
 def _apart(
