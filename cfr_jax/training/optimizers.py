@@ -65,7 +65,7 @@ class Stairs:
     def at(self, count: ArrayLike, steps: ArrayLike) -> Array:
         """The same in a training of so many steps."""
         done, steps = jnp.asarray(count, jnp.float32), jnp.asarray(steps, jnp.float32)
-        fallen = sum((done >= drop * steps).astype(jnp.float32) for drop in self.drops)
+        fallen = sum((done >= jnp.round(drop * steps)).astype(jnp.float32) for drop in self.drops)
         return self.peak_rate * jnp.float32(self.factor) ** fallen
 
 

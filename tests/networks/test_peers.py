@@ -26,7 +26,7 @@ STATES = {
 }
 # How far two programs in float32 may be apart. The Jacobian of FMR is of finite differences, which
 # make a hundred times as much of every rounding.
-LOOSE = {"dcp": 2e-5, "fmr": 1e-4, "rgm": 2e-5}
+LOOSE = {"dcp": 2e-5, "fmr": 1e-4}
 REFERENCES = {
     "dcp": lambda state, x, y: dcp_oracle.register(state, x, y)[None],
     "fmr": fmr_oracle.register,
@@ -34,7 +34,9 @@ REFERENCES = {
 }
 
 
-@pytest.fixture(params=STATES)
+# The hard assignments of random weights may turn on a rounding: RGM is compared in float64, and by
+# its soft assignments.
+@pytest.fixture(params=["dcp v1", "dcp v2", "fmr"])
 def named(request):
     """Name of the network, the state dict, the parameters."""
     state = STATES[request.param]()
@@ -66,53 +68,61 @@ def test_it_answers_as_the_reference(named):
     np.testing.assert_allclose(found, wanted, atol=LOOSE[name] / 2)
 
 
-def test_fmr_answers_as_the_reference_to_all_digits_in_float64(x64):
-    state = STATES["fmr"]()
+@pytest.mark.parametrize("name", ["fmr", "rgm"])
+def test_it_answers_as_the_reference_to_all_digits_in_float64(x64, name):
+    state = STATES[name]()
     pair = clouds.random_pair(3, N, M)
-    with jax.enable_x64(False):
-        params = from_state_dict(state)
-    params = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), params)
     sides = [cloud(points.astype(np.float64)) for points in (pair.x, pair.y)]
 
-    found = answer("fmr", params, *sides)
-    remade = fmr.FMR().apply({"params": params}, sides[0].points)
+    found = answer(name, in_float64(state), *sides)
 
-    np.testing.assert_allclose(found, fmr_oracle.register(state, pair.x, pair.y), atol=1e-9)
-    vector = fmr_oracle.encode(state, pair.x.astype(np.float64))
-    np.testing.assert_allclose(remade, fmr_oracle.decode(state, vector), atol=1e-9)
+    np.testing.assert_allclose(found, REFERENCES[name](state, pair.x, pair.y), atol=1e-9)
 
 
-def test_pairs_of_a_batch_are_answered_as_one_by_one(named):
+def test_the_decoder_of_fmr_is_that_of_the_reference(x64):
+    state = STATES["fmr"]()
+    points = clouds.random_pair(3, N, M).x.astype(np.float64)
+
+    remade = fmr.FMR().apply({"params": in_float64(state)}, jnp.asarray(points))
+
+    wanted = fmr_oracle.decode(state, fmr_oracle.encode(state, points))
+    np.testing.assert_allclose(remade, wanted, atol=1e-9)
+
+
+def in_float64(state):
+    with jax.enable_x64(False):
+        params = from_state_dict(state)
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float64), params)
+
+
+def test_neither_padding_nor_a_batch_changes_the_answers(named):
+    # given two pairs, each cloud followed by rows that do not count
     name, _, params = named
     pairs = [clouds.random_pair(seed, N, M) for seed in (3, 4)]
     sides = [(cloud(pair.x), cloud(pair.y)) for pair in pairs]
+    padded = [
+        tuple(with_padding(side, more) for side, more in zip(pair, (7, 9), strict=True))
+        for pair in sides
+    ]
 
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sides)
+    # when
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
     together = jax.vmap(lambda pair: answer(name, params, *pair))(batch)
 
+    # then
     for found, side in zip(together, sides, strict=True):
         np.testing.assert_allclose(found, answer(name, params, *side), atol=LOOSE[name])
 
 
-def test_padding_does_not_change_the_answer(named):
-    name, _, params = named
-    pair = clouds.random_pair(3, N, M)
-    source, target = cloud(pair.x), cloud(pair.y)
-    padded = []
-    for plain, more in ((source, 7), (target, 9)):
-        wrong = jnp.full((more, 3), 0.4)
-        padded.append(
-            Cloud(
-                jnp.concatenate([plain.points, wrong]),
-                jnp.zeros((len(plain.points) + more, 3)),
-                jnp.pad(plain.neighbors, ((0, more), (0, 0))),
-                jnp.arange(len(plain.points) + more) < len(plain.points),
-            )
-        )
-
-    found = answer(name, params, *padded)
-
-    np.testing.assert_allclose(found, answer(name, params, source, target), atol=LOOSE[name])
+def with_padding(plain, more):
+    n = len(plain.points)
+    wrong = jnp.full((more, 3), 0.4)
+    return Cloud(
+        jnp.concatenate([plain.points, wrong]),
+        jnp.zeros((n + more, 3)),
+        jnp.pad(plain.neighbors, ((0, more), (0, 0))),
+        jnp.arange(n + more) < n,
+    )
 
 
 @pytest.mark.parametrize("slack", [True, False])
@@ -121,10 +131,15 @@ def test_soft_assignments_of_rgm_are_those_of_the_reference(slack):
     pair = clouds.random_pair(5, M, M)
     wanted = rgm_oracle.soft_assignment(state, pair.x, pair.y, slack=slack)
 
-    network = rgm.module_of(from_state_dict(state), rgm.RGMSettings(slack=slack))
-    found = network.bind({"params": from_state_dict(state)})(cloud(pair.x), cloud(pair.y))
+    params = from_state_dict(state)
+    network = rgm.module_of(params, rgm.RGMSettings(slack=slack)).bind({"params": params})
+    source, target = cloud(pair.x), cloud(pair.y)
+    found = network(source, target)
+    padded = network(with_padding(source, 7), with_padding(target, 9))
 
     np.testing.assert_allclose(np.exp(found), wanted, atol=1e-5)
+    np.testing.assert_allclose(np.exp(padded)[:M, :M], wanted, atol=1e-5)
+    assert not np.exp(padded)[M:].any() and not np.exp(padded)[:, M:].any()
     assert wanted.max() > 0.05  # not spread evenly: an entry would have 1 / 55
 
 
