@@ -1,0 +1,144 @@
+"""One cloud of all scans: the mean point of each cube of a grid, scan after scan.
+
+Memory holds one scan and what has been fused so far; the scans are read again one by one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from cfr_jax.data.scans import estimate_normals
+from cfr_jax.geometry import motions
+from cfr_jax.io import PointCloud
+
+_NEIGHBORS = 16  # of a normal, where the scans bring none
+_COMPACTED = 1 << 22  # rows that may wait before cubes of several scans are put together
+_MOST_CELLS = 1 << 20  # along an axis: what fits three times in 63 bits
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """A merged cloud."""
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    """Unit normals: the mean of the scans' own, or estimated, pointing away from the centroid."""
+    scan: Int[np.ndarray, " n"]
+    """Index of the scan that gave most to each point."""
+    count: Int[np.ndarray, " n"]
+    """How many points each is the mean of."""
+    voxel: float
+
+    def as_cloud(self, name: str = "model") -> PointCloud:
+        """Points and normals, as `io.write` takes them."""
+        return PointCloud(self.points, self.normals, name)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cubes:
+    """Sums over the points of each cube; several rows may be of one cube."""
+
+    cell: Int[np.ndarray, "n 3"]
+    sums: Float[np.ndarray, "n 6"]
+    count: Int[np.ndarray, " n"]
+    most: Int[np.ndarray, " n"]
+    """How many came from `scan`, which gave most."""
+    scan: Int[np.ndarray, " n"]
+
+
+def fuse(
+    placed: Iterable[tuple[int, PointCloud, Float[np.ndarray, "4 4"]]], voxel: float
+) -> Fused:
+    """The mean point of each cube with edges of length `voxel`.
+
+    `placed` gives the index of each scan, its points, and the motion into the model's frame. Raises
+    ValueError for a voxel that is not positive or far too small for the model, and for no scans.
+    """
+    if not (voxel > 0 and math.isfinite(voxel)):
+        raise ValueError(f"voxel: got {voxel}, wanted a positive length")
+    held: list[_Cubes] = []
+    origin, bare, waiting = None, False, 0
+    for index, cloud, pose in placed:
+        points = motions.apply(pose, cloud.points)
+        if origin is None:
+            origin = np.floor(points.mean(axis=0) / voxel) * voxel
+        bare |= cloud.normals is None
+        normals = np.zeros_like(points) if bare else motions.rotate(pose, cloud.normals)
+        held.append(_cubes(index, points - origin, normals, voxel))
+        waiting += len(held[-1].count)
+        if waiting > _COMPACTED:
+            held, waiting = [_compacted(held)], 0
+    if origin is None:
+        raise ValueError("wanted at least one scan to make a cloud of")
+    cubes = _compacted(held)
+    points = cubes.sums[:, :3] / cubes.count[:, None] + origin
+    normals = cubes.sums[:, 3:]
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    if bare or not (length > 1e-6).all():
+        normals = _estimated(points - origin)
+    else:
+        normals = normals / length
+    return Fused(points, normals, cubes.scan, cubes.count, voxel)
+
+
+def _cubes(index: int, points: np.ndarray, normals: np.ndarray, voxel: float) -> _Cubes:
+    cells = np.floor(points / voxel)
+    if np.abs(cells).max() >= _MOST_CELLS / 2:
+        raise ValueError(
+            f"voxel: got {voxel:g}, wanted at least {np.abs(points).max() * 2 / _MOST_CELLS:.2g} "
+            "for a model of this size"
+        )
+    count = np.ones(len(points), np.int64)
+    made = _Cubes(
+        cells.astype(np.int64),
+        np.concatenate([points, normals], axis=1),
+        count,
+        count,
+        np.full(len(points), index),
+    )
+    return _summed(made)
+
+
+def _compacted(held: list[_Cubes]) -> _Cubes:
+    joined = _Cubes(
+        *(
+            np.concatenate([getattr(each, name) for each in held])
+            for name in ("cell", "sums", "count", "most", "scan")
+        )
+    )
+    return _summed(joined)
+
+
+def _summed(cubes: _Cubes) -> _Cubes:
+    """One row for each cube, in the order of the cubes."""
+    shifted = cubes.cell + _MOST_CELLS // 2
+    key = (shifted[:, 0] * _MOST_CELLS + shifted[:, 1]) * _MOST_CELLS + shifted[:, 2]
+    # within a cube the scan that gave most comes first
+    order = np.lexsort((cubes.scan, -cubes.most, key))
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    first = order[starts]
+    # what one scan gave is one row already, unless its own points are being summed
+    own = np.add.reduceat(cubes.count[order], starts)
+    same = cubes.scan[order] == np.repeat(cubes.scan[first], np.diff([*starts, len(order)]))
+    most = np.add.reduceat(np.where(same, cubes.most[order], 0), starts)
+    return _Cubes(
+        cubes.cell[first],
+        np.add.reduceat(cubes.sums[order], starts, axis=0),
+        own,
+        most,
+        cubes.scan[first],
+    )
+
+
+def _estimated(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    if len(points) < 3:
+        return np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    inward = estimate_normals(
+        points, math.inf, _NEIGHBORS, viewpoint=tuple(points.mean(axis=0).tolist())
+    )
+    return -inward

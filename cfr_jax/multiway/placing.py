@@ -1,0 +1,192 @@
+"""From edges to poses: which edges to build on, which scans belong together, where each lies.
+
+An edge is built on where a cycle of three confirms it, or where its confidence is high and no
+cycle of such edges speaks against it. Parts of a model that are found so are put together where two
+edges between them agree. What is then not connected stays apart.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from cfr_jax.geometry import twists
+from cfr_jax.multiway import cycles, graph, robust
+from cfr_jax.multiway.graph import Edges
+from cfr_jax.multiway.robust import LIMIT
+
+SURE = 0.9  # confidence that needs nobody's confirmation
+POSSIBLE = 0.1  # below this, an edge is not looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Poses and edges that agree with each other."""
+
+    poses: Float[np.ndarray, "n 4 4"]
+    """Of each scan, in the frame of the first scan of its component."""
+    component: Int[np.ndarray, " n"]
+    """0 for the largest; a scan alone is a component, too."""
+    kept: Bool[np.ndarray, " e"]
+    """Edges that the poses agree with."""
+    strong: Bool[np.ndarray, " e"]
+    """Edges that could be built on."""
+
+
+def place(
+    count: int,
+    edges: Edges,
+    confidence: Float[np.ndarray, " e"],
+    determined: Bool[np.ndarray, " e"],
+) -> Placement:
+    """Poses for `count` scans. At most one edge may connect two scans."""
+    strong = build_on(edges, confidence, determined)
+    closing, having = cycles.votes(edges)
+    order = cycles.confirmed_order(closing, having, confidence)
+    held, rejected = strong.copy(), np.zeros(len(edges), bool)
+    while True:
+        labels = _components(count, edges.take(held))
+        fixed = first_of_each(labels)
+        poses = _along_tree(count, edges.take(held), order[held], fixed)
+        poses, agreeing = robust.solve_robustly(
+            edges.take(held), poses, fixed, prior=confidence[held]
+        )
+        if not agreeing.all():
+            # this may leave parts that hang together no more: then each is solved alone
+            rejected[np.flatnonzero(held)[~agreeing]] = True
+            held &= ~rejected
+            continue
+        open_ = ~held & ~rejected & (confidence >= POSSIBLE)
+        more = agreeing_between(edges, poses, labels, open_)
+        if not more.any():
+            break
+        held |= more
+    within = labels[edges.source] == labels[edges.target]
+    # edges that were too weak to build on may still agree
+    off = graph.chi_squares(edges, poses)
+    kept = held | (within & (confidence >= POSSIBLE) & (off <= LIMIT))
+    return Placement(poses, labels, kept, strong)
+
+
+def build_on(
+    edges: Edges, confidence: Float[np.ndarray, " e"], determined: Bool[np.ndarray, " e"]
+) -> Bool[np.ndarray, " e"]:
+    """Which edges are good enough to give scans their places."""
+    possible = confidence >= POSSIBLE
+    strong = np.zeros(len(edges), bool)
+    rows = np.flatnonzero(possible)
+    found = cycles.triangles(edges.take(rows))
+    good = cycles.closed(edges.take(rows), found)
+    strong[rows[np.unique(found[good])]] = True
+    sure = determined & (confidence >= SURE)
+    against = ~good & sure[rows[found]].all(axis=1)
+    doubted = np.zeros(len(edges), bool)
+    doubted[rows[np.unique(found[against])]] = True
+    return strong | (sure & ~doubted)
+
+
+def agreeing_between(
+    edges: Edges,
+    poses: Float[np.ndarray, "n 4 4"],
+    labels: Int[np.ndarray, " n"],
+    among: Bool[np.ndarray, " e"],
+) -> Bool[np.ndarray, " e"]:
+    """Edges between two components that lay these on each other in the same way: two or more."""
+    rows = np.flatnonzero(among & (labels[edges.source] != labels[edges.target]))
+    chosen = np.zeros(len(edges), bool)
+    parts = np.sort(np.stack([labels[edges.source], labels[edges.target]], axis=1), axis=1)
+    for pair in np.unique(parts[rows], axis=0):
+        here = rows[(parts[rows] == pair).all(axis=1)]
+        best = max(
+            (here[_agreeing(edges, poses, labels, row, here)] for row in here.tolist()), key=len
+        )
+        if len(best) > 1:
+            chosen[best] = True
+    return chosen
+
+
+def _agreeing(
+    edges: Edges,
+    poses: Float[np.ndarray, "n 4 4"],
+    labels: Int[np.ndarray, " n"],
+    row: int,
+    others: Int[np.ndarray, " k"],
+) -> Bool[np.ndarray, " k"]:
+    """Which of the others agree with one edge, once it has laid one component on the other."""
+    source, target = edges.source[row], edges.target[row]
+    laid = poses[target] @ edges.transform[row] @ twists.inverse(poses[source])
+    moved = np.where(
+        (labels == labels[source])[:, None, None], laid @ poses, poses
+    )
+    taken = edges.take(others)
+    off = graph.residuals(taken, moved)
+    # the edge that lays them is noisy itself, and moves what is far from it by more
+    carried = twists.adjoint(twists.inverse(moved[taken.source]) @ moved[source])
+    noise = carried @ np.linalg.inv(edges.information[row]) @ carried.swapaxes(-1, -2)
+    spread = np.linalg.inv(taken.information) + noise
+    return np.einsum("ei,ei->e", off, np.linalg.solve(spread, off[..., None])[..., 0]) <= LIMIT
+
+
+def first_of_each(labels: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Marks the first scan of each component."""
+    first = np.zeros(len(labels), bool)
+    first[np.unique(labels, return_index=True)[1]] = True
+    return first
+
+
+def _components(count: int, edges: Edges) -> Int[np.ndarray, " n"]:
+    """The number of each scan's component, the largest first, equal ones in order."""
+    links = sparse.coo_matrix(
+        (np.ones(len(edges)), (edges.source, edges.target)), shape=(count, count)
+    )
+    _, labels = csgraph.connected_components(links, directed=False)
+    _, first, sizes = np.unique(labels, return_index=True, return_counts=True)
+    rank = np.empty(len(sizes), np.int64)
+    rank[np.lexsort((first, -sizes))] = np.arange(len(sizes))
+    return rank[labels]
+
+
+def _along_tree(
+    count: int, edges: Edges, order: Float[np.ndarray, " e"], fixed: Bool[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """First poses: from the fixed scans on, always along the best edge that leads to a new one."""
+    poses = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
+    known = fixed.copy()
+    for row in _tree(count, edges, order, fixed):
+        source, target = edges.source[row], edges.target[row]
+        if known[target]:
+            poses[source] = poses[target] @ edges.transform[row]
+            known[source] = True
+        else:
+            poses[target] = poses[source] @ twists.inverse(edges.transform[row])
+            known[target] = True
+    return poses
+
+
+def _tree(
+    count: int, edges: Edges, order: Float[np.ndarray, " e"], fixed: Bool[np.ndarray, " n"]
+) -> list[int]:
+    """Rows of a spanning forest of the best edges, each next to what came before (Prim)."""
+    beside: list[list[int]] = [[] for _ in range(count)]
+    for row, ends in enumerate(zip(edges.source.tolist(), edges.target.tolist(), strict=True)):
+        for scan in ends:
+            beside[scan].append(row)
+    known, chosen = fixed.copy(), []
+    waiting = [(-order[row], row) for scan in np.flatnonzero(fixed) for row in beside[scan]]
+    heapq.heapify(waiting)
+    while waiting:
+        _, row = heapq.heappop(waiting)
+        ends = edges.source[row], edges.target[row]
+        new = [scan for scan in ends if not known[scan]]
+        if not new:
+            continue
+        known[new] = True
+        chosen.append(row)
+        for other in beside[new[0]]:
+            heapq.heappush(waiting, (-order[other], other))
+    return chosen

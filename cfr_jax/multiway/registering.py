@@ -1,0 +1,101 @@
+"""Pairs of scans registered by `align_many`, each only once: what is in the journal is not redone.
+
+A target that many scans share is encoded once: `choosing` orders the pairs so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+from cfr_jax.alignment.align import align
+from cfr_jax.batch.jobs import Job
+from cfr_jax.batch.records import as_record
+from cfr_jax.batch.stream import Outcome, align_many
+from cfr_jax.multiway.choosing import Try
+from cfr_jax.multiway.scans import Scan
+from cfr_jax.runtime.progress import Progress
+
+Record = dict[str, Any]
+NEAR, CLOSURE, ANYWHERE = range(3)
+"""Which try of two scans it is: from where they lie, from where the poses lay them, or from all
+rotations. It tells the records of two scans apart."""
+
+
+class Kept(Protocol):
+    """Where records are kept: `batch.journal.Journal` is one."""
+
+    done: dict[tuple[str, str, int], Record]
+
+    def write(self, record: Record) -> None:
+        """Keeps a record."""
+
+
+class Memory:
+    """Records that are kept as long as the program runs."""
+
+    def __init__(self) -> None:
+        self.done: dict[tuple[str, str, int], Record] = {}
+
+    def write(self, record: Record) -> None:
+        """Keeps a record."""
+        self.done[record["source"], record["target"], record["repeat"]] = record
+
+
+class Registrar:
+    """Registers pairs of scans, and knows those that are done."""
+
+    def __init__(
+        self, scans: Mapping[int, Scan], kept: Kept, options: dict[str, Any], *, progress: bool
+    ):
+        self._scans, self._kept = scans, kept
+        self._options, self._progress = options, progress
+
+    def records(self, tries: Sequence[Try], kind: int) -> list[Record]:
+        """The record of each pair, in order."""
+        jobs = [self._job(pair, kind) for pair in tries]
+        left = [row for row, job in enumerate(jobs) if self._found(job, tries[row]) is None]
+        if left:
+            with Progress(
+                total=len(jobs),
+                initial=len(jobs) - len(left),
+                desc="registering",
+                unit=" pairs",
+                disable=not self._progress,
+            ) as bar:
+                for outcome in self._outcomes([tries[row] for row in left], kind):
+                    row = left[outcome.index]
+                    record = as_record(jobs[row], outcome)
+                    self._kept.write(record | {"digests": self._digests(tries[row])})
+                    bar.update()
+        return [self._kept.done[job.key] for job in jobs]
+
+    def _outcomes(self, tries: list[Try], kind: int) -> Any:
+        if kind != ANYWHERE:
+            return align_many(
+                (self._pair(each) for each in tries), ordered=False, **self._options
+            )
+        single = {name: value for name, value in self._options.items() if name not in _OF_BATCHES}
+        return (
+            Outcome(row, align(*self._pair(each)[:2], initial="global", **single), None)
+            for row, each in enumerate(tries)
+        )
+
+    def _pair(self, pair: Try) -> tuple[Any, ...]:
+        clouds = self._scans[pair.source].cloud, self._scans[pair.target].cloud
+        return clouds if pair.initial is None else (*clouds, pair.initial)
+
+    def _job(self, pair: Try, kind: int) -> Job:
+        names = self._scans[pair.source].name, self._scans[pair.target].name
+        return Job(*names, kind, lambda: self._pair(pair)[:2])
+
+    def _digests(self, pair: Try) -> list[str]:
+        return [self._scans[pair.source].digest, self._scans[pair.target].digest]
+
+    def _found(self, job: Job, pair: Try) -> Record | None:
+        """The record of a pair that is done, unless one of its files has changed since."""
+        record = self._kept.done.get(job.key)
+        return record if record and record.get("digests") == self._digests(pair) else None
+
+
+_OF_BATCHES = ("batch", "workers")
