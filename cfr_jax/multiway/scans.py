@@ -42,6 +42,8 @@ class Scan:
     radius: float
     digest: str
     """Of all its points: equal for scans that are the same."""
+    total: int
+    """How many points it has unthinned."""
 
     @functools.cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
@@ -120,6 +122,7 @@ def load(
             frames.source_center,
             frames.scale,
             hashlib.sha256(cloud.points.tobytes()).hexdigest()[:16],
+            len(cloud),
         )
 
 

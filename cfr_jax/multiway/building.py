@@ -1,0 +1,147 @@
+"""From registered pairs to a model: the graph of what was measured, and the places it gives."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from cfr_jax.multiway import choosing, contact, graph, joint, placing
+from cfr_jax.multiway.choosing import Try
+from cfr_jax.multiway.placing import Placement
+from cfr_jax.multiway.registering import Record
+from cfr_jax.multiway.scans import Scan
+
+REACH = 3.0  # spacings: how far two points may be apart and still say something of an edge
+PARTNERS = 6  # scans with which a scan is refined together
+
+
+@dataclass(frozen=True, eq=False)
+class Build:
+    """Registered pairs as the edges of a graph, and what followed. Scans are rows here."""
+
+    records: tuple[Record, ...]
+    """What was found of each edge."""
+    edges: graph.Edges
+    confidence: Float[np.ndarray, " e"]
+    """0 where it is unknown."""
+    determined: Bool[np.ndarray, " e"]
+    failures: tuple[tuple[int, int, str], ...]
+    """Pairs that could not be registered at all, and why."""
+    placement: Placement
+
+
+def build(scans: Sequence[Scan], tries: Sequence[Try], records: Sequence[Record]) -> Build:
+    """Poses from registered pairs. Of several records of two scans, the most confident counts."""
+    row_of = {scan.index: row for row, scan in enumerate(scans)}
+    best: dict[frozenset[int], tuple[Try, Record]] = {}
+    failures = []
+    for pair, record in zip(tries, records, strict=True):
+        if record["error"] is not None:
+            failures.append((row_of[pair.source], row_of[pair.target], record["error"]))
+            continue
+        key = frozenset((pair.source, pair.target))
+        if key not in best or _sureness(record) > _sureness(best[key][1]):
+            best[key] = pair, record
+    source, target, transforms, informations = [], [], [], []
+    for pair, record in best.values():
+        first, second = scans[row_of[pair.source]], scans[row_of[pair.target]]
+        transform = choosing.to_centered(
+            np.array(record["transform"]), first.center, second.center
+        )
+        source.append(row_of[pair.source])
+        target.append(row_of[pair.target])
+        transforms.append(transform)
+        informations.append(measured(first, second, transform)[0])
+    count = len(best)
+    edges = graph.Edges(
+        np.array(source, np.int64),
+        np.array(target, np.int64),
+        np.array(transforms).reshape(count, 4, 4),
+        np.array(informations).reshape(count, 6, 6),
+    )
+    confidence = np.array([_sureness(record) for _, record in best.values()], np.float64)
+    determined = np.array([record["determined"] for _, record in best.values()], bool)
+    return Build(
+        tuple(record for _, record in best.values()),
+        edges,
+        confidence,
+        determined,
+        tuple(failures),
+        placing.place(len(scans), edges, confidence, determined),
+    )
+
+
+def measured(
+    source: Scan, target: Scan, transform: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, "6 6"], float]:
+    """Information of a motion between two scans, and the RMS distance to the planes."""
+    reach = REACH * max(source.spacing, target.spacing)
+    return contact.information(source, target, transform, reach)
+
+
+def refined(
+    scans: Sequence[Scan], built: Build
+) -> tuple[Build, Float[np.ndarray, "n 6 6"]]:
+    """The same, with each component refined as a whole, and the covariance of each pose.
+
+    The covariance is that of a pose graph of all pairs that were refined together, each with the
+    information of its surfaces.
+    """
+    placement = built.placement
+    poses = placement.poses.copy()
+    spread = np.zeros((len(scans), 6, 6))
+    for label in np.unique(placement.component):
+        rows = np.flatnonzero(placement.component == label)
+        if len(rows) < 2:
+            continue
+        members = [scans[row] for row in rows]
+        pairs = _pairs(members, poses[rows], rows, built)
+        fixed = np.arange(len(rows)) == 0
+        poses[rows] = joint.refine(members, poses[rows], pairs, fixed)
+        spread[rows] = _covariances(members, poses[rows], pairs, fixed)
+    return dataclasses.replace(
+        built, placement=dataclasses.replace(placement, poses=poses)
+    ), spread
+
+
+def _pairs(
+    scans: Sequence[Scan],
+    poses: Float[np.ndarray, "n 4 4"],
+    rows: Int[np.ndarray, " n"],
+    built: Build,
+) -> Int[np.ndarray, "p 2"]:
+    """What to refine together: scans that overlap most, and those that an edge ties together."""
+    place = {row: number for number, row in enumerate(rows.tolist())}
+    found = {tuple(pair) for pair in choosing.overlapping(scans, poses, PARTNERS).tolist()}
+    held = np.flatnonzero(built.placement.kept & built.placement.strong)
+    for source, target in zip(
+        built.edges.source[held].tolist(), built.edges.target[held].tolist(), strict=True
+    ):
+        if source in place and target in place:
+            found.add(tuple(sorted((place[source], place[target]))))
+    return np.array(sorted(found), np.int64).reshape(-1, 2)
+
+
+def _covariances(
+    scans: Sequence[Scan],
+    poses: Float[np.ndarray, "n 4 4"],
+    pairs: Int[np.ndarray, "p 2"],
+    fixed: Bool[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 6 6"]:
+    between = np.linalg.inv(poses[pairs[:, 1]]) @ poses[pairs[:, 0]]
+    information = [
+        measured(scans[first], scans[second], motion)[0]
+        for (first, second), motion in zip(pairs, between, strict=True)
+    ]
+    edges = graph.Edges(
+        pairs[:, 0], pairs[:, 1], between, np.array(information).reshape(-1, 6, 6)
+    )
+    return graph.covariances(edges, poses, fixed)
+
+
+def _sureness(record: Record) -> float:
+    return 0.0 if record["confidence"] is None else float(record["confidence"])

@@ -1,0 +1,228 @@
+"""`merge`: many scans of one thing, and the pose of each in one model."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cfr_jax.geometry import motions
+from cfr_jax.io import PointCloud, as_point_cloud
+from cfr_jax.multiway import choosing
+from cfr_jax.multiway.answers import Merged
+from cfr_jax.multiway.building import Build, build, refined
+from cfr_jax.multiway.choosing import Try
+from cfr_jax.multiway.fusing import Fused, fuse
+from cfr_jax.multiway.placing import SURE
+from cfr_jax.multiway.registering import (
+    ANYWHERE,
+    CLOSURE,
+    NEAR,
+    Kept,
+    Memory,
+    Record,
+    Registrar,
+)
+from cfr_jax.multiway.reporting import answer
+from cfr_jax.multiway.scans import LeftOut, Scan, load, names_of, of_other_sizes, twins
+from cfr_jax.runtime.progress import Progress
+
+_CLOSING = 4  # other scans with which a scan may close loops
+_ENOUGH = 2  # answers of a search that are sure: then a scan needs no more
+
+
+def merge(
+    clouds: Sequence[Any],
+    *,
+    params: dict | None = None,
+    sequence: bool = False,
+    everywhere: bool = False,
+    loop_closures: bool = False,
+    guesses: Sequence[Float[np.ndarray, "4 4"] | None] | None = None,
+    reference: int | None = None,
+    voxel: float | None = None,
+    fused: bool = True,
+    max_points: int | None = None,
+    seed: int = 0,
+    batch: int | None = None,
+    workers: int | None = None,
+    kept: Kept | None = None,
+    progress: bool = False,
+) -> Merged:
+    """Lays many scans of one thing together: the pose of each, and one cloud.
+
+    `clouds` are what `align` takes. Pairs of them are registered by `align_many`: all, or with
+    `sequence` each with the next two, and with `loop_closures` then also those that the poses so
+    far bring together. Clouds may lie up to about 45 degrees about each axis from each other; with
+    `everywhere`, scans that found no place so are tried from all rotations, too. `guesses` are
+    poses to start from, as far as they are known (None for the others).
+
+    Edges that contradict others are found and dropped, a pose graph is solved, and all scans are
+    refined together. A scan is placed only where a cycle of registrations confirms its place or
+    one is sure of it; all others are listed in `left_out` with the reason. Scans that do not hang
+    together become components of their own.
+
+    Poses map each scan into the frame of `reference`, an index (default: the first placed scan).
+    Each component has a merged cloud with one point for each cube of size `voxel` (default: the
+    spacing of the scans' points), unless `fused` is False.
+
+    `kept` stores what is registered and is asked first (`batch.journal.Journal`), so that a run
+    that was killed goes on where it was. `max_points`, `seed`, `batch` and `workers` are those of
+    `align_many`. The same call gives the same answer.
+
+    Raises ValueError for options that cannot be used, and where fewer than two scans can be read.
+    """
+    began = time.perf_counter()
+    clouds = list(clouds)
+    _check(clouds, guesses, reference, voxel)
+    names = names_of(clouds)
+    seconds: dict[str, float] = {}
+    scans, left_out = _read(clouds, names, seed, progress)
+    copies = twins(scans)
+    foreign = of_other_sizes(scans)
+    left_out += foreign
+    apart = {each.index for each in foreign} | copies.keys()
+    usable = [scan for scan in scans if scan.index not in apart]
+    if len(usable) < 2:
+        reasons = "; ".join(f"{each.name}: {each.reason}" for each in left_out[:2])
+        raise ValueError(f"clouds: wanted at least two scans that can be merged ({reasons})")
+    seconds["read"] = time.perf_counter() - began
+
+    started = time.perf_counter()
+    by_index = {scan.index: scan for scan in usable}
+    options = {
+        "params": params,
+        "max_points": max_points,
+        "seed": seed,
+        "batch": batch,
+        "workers": workers,
+    }
+    registrar = Registrar(by_index, kept or Memory(), options, progress=progress)
+    tries = choosing.in_sequence(usable) if sequence else choosing.all_pairs(usable)
+    if guesses is not None:
+        known = {index: pose for index, pose in enumerate(guesses) if pose is not None}
+        tries = choosing.from_guesses(tries, known)
+    records = registrar.records(tries, NEAR)
+    built = build(usable, tries, records)
+    if everywhere and built.placement.component.any():
+        tries, records, built = _search(usable, registrar, tries, records)
+    if loop_closures and (more := _closures(usable, tries, built)):
+        records = records + registrar.records(more, CLOSURE)
+        built = build(usable, tries + more, records)
+    seconds["register"] = time.perf_counter() - started
+
+    started = time.perf_counter()
+    built, covariances = refined(usable, built)
+    seconds["refine"] = time.perf_counter() - started
+
+    started = time.perf_counter()
+    found = answer(names, usable, built, covariances, left_out, copies, reference)
+    models = _fused(clouds, scans, found, copies, voxel, progress) if fused else ()
+    seconds["fuse"] = time.perf_counter() - started
+    seconds["total"] = time.perf_counter() - began
+    return dataclasses.replace(found, clouds=models, seconds=seconds)
+
+
+def _check(
+    clouds: Sequence[Any],
+    guesses: Sequence[Any] | None,
+    reference: int | None,
+    voxel: float | None,
+) -> None:
+    if len(clouds) < 2:
+        raise ValueError(f"clouds: got {len(clouds)}, wanted at least two scans")
+    if guesses is not None:
+        if len(guesses) != len(clouds):
+            raise ValueError(
+                f"guesses: got {len(guesses)} for {len(clouds)} clouds, wanted one (or None) each"
+            )
+        for index, guess in enumerate(guesses):
+            if guess is not None:
+                motions.check_rigid(f"guesses[{index}]", guess)
+    if reference is not None and not 0 <= reference < len(clouds):
+        raise ValueError(f"reference: got {reference}, wanted 0 to {len(clouds) - 1}")
+    if voxel is not None and not voxel > 0:
+        raise ValueError(f"voxel: got {voxel}, wanted a positive length")
+
+
+def _read(
+    clouds: Sequence[Any], names: Sequence[str], seed: int, progress: bool
+) -> tuple[list[Scan], list[LeftOut]]:
+    scans, left_out = [], []
+    loaded = load(clouds, names, seed=seed)
+    for each in Progress(
+        loaded, total=len(clouds), desc="reading", unit=" scans", disable=not progress
+    ):
+        (scans if isinstance(each, Scan) else left_out).append(each)  # type: ignore[arg-type]
+    return scans, left_out
+
+
+def _search(
+    scans: Sequence[Scan],
+    registrar: Registrar,
+    tries: list[Try],
+    records: list[Record],
+) -> tuple[list[Try], list[Record], Build]:
+    """Tries scans that are not in the largest component from all rotations, one after the other:
+    a search takes some times as long, and a scan that has found its place needs no other."""
+    built = build(scans, tries, records)
+    for row in np.flatnonzero(built.placement.component > 0):
+        if built.placement.component[row] == 0:
+            continue
+        others = np.flatnonzero(built.placement.component != built.placement.component[row])
+        sure = 0
+        for other in others:
+            [pair] = choosing.all_pairs([scans[row], scans[other]])
+            tries, records = [*tries, pair], [*records, *registrar.records([pair], ANYWHERE)]
+            sure += (records[-1]["confidence"] or 0.0) >= SURE
+            if sure >= _ENOUGH:
+                break
+        built = build(scans, tries, records)
+    return tries, records, built
+
+
+def _closures(scans: Sequence[Scan], tries: Sequence[Try], built: Build) -> list[Try]:
+    known = {frozenset((pair.source, pair.target)) for pair in tries}
+    made = []
+    placement = built.placement
+    for label in np.unique(placement.component):
+        rows = np.flatnonzero(placement.component == label)
+        members = [scans[row] for row in rows]
+        made += choosing.brought_together(members, placement.poses[rows], known, _CLOSING)
+    return made
+
+
+def _fused(
+    clouds: Sequence[Any],
+    scans: Sequence[Scan],
+    found: Merged,
+    copies: Mapping[int, int],
+    voxel: float | None,
+    progress: bool,
+) -> tuple[Fused, ...]:
+    size = voxel or float(np.median([_full_spacing(scan) for scan in scans]))
+    models = []
+    with Progress(
+        total=len(found.placed), desc="fusing", unit=" scans", disable=not progress
+    ) as bar:
+
+        def members(rows: np.ndarray) -> Iterator[tuple[int, PointCloud, np.ndarray]]:
+            for row in rows:
+                index = int(found.placed[row])
+                if index not in copies:  # the same points again would count twice
+                    cloud = as_point_cloud(clouds[index], name=found.names[index])
+                    yield index, cloud, found.poses[row]
+                bar.update()
+
+        for _, rows in found.by_component():
+            models.append(fuse(members(rows), size))
+    return tuple(models)
+
+
+def _full_spacing(scan: Scan) -> float:
+    """About the distance between neighbors among all points of a scan, on a surface."""
+    return scan.spacing * float(np.sqrt(len(scan.cloud) / scan.total))
