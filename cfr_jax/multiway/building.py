@@ -49,9 +49,7 @@ def build(scans: Sequence[Scan], tries: Sequence[Try], records: Sequence[Record]
     source, target, transforms, informations = [], [], [], []
     for pair, record in best.values():
         first, second = scans[row_of[pair.source]], scans[row_of[pair.target]]
-        transform = choosing.to_centered(
-            np.array(record["transform"]), first.center, second.center
-        )
+        transform = choosing.to_centered(np.array(record["transform"]), first.center, second.center)
         source.append(row_of[pair.source])
         target.append(row_of[pair.target])
         transforms.append(transform)
@@ -83,9 +81,7 @@ def measured(
     return contact.information(source, target, transform, reach)
 
 
-def refined(
-    scans: Sequence[Scan], built: Build
-) -> tuple[Build, Float[np.ndarray, "n 6 6"]]:
+def refined(scans: Sequence[Scan], built: Build) -> tuple[Build, Float[np.ndarray, "n 6 6"]]:
     """The same, with each component refined as a whole, and the covariance of each pose.
 
     The covariance is that of a pose graph of all pairs that were refined together, each with the
@@ -103,9 +99,7 @@ def refined(
         fixed = np.arange(len(rows)) == 0
         poses[rows] = joint.refine(members, poses[rows], pairs, fixed)
         spread[rows] = _covariances(members, poses[rows], pairs, fixed)
-    return dataclasses.replace(
-        built, placement=dataclasses.replace(placement, poses=poses)
-    ), spread
+    return dataclasses.replace(built, placement=dataclasses.replace(placement, poses=poses)), spread
 
 
 def _pairs(
@@ -137,9 +131,7 @@ def _covariances(
         measured(scans[first], scans[second], motion)[0]
         for (first, second), motion in zip(pairs, between, strict=True)
     ]
-    edges = graph.Edges(
-        pairs[:, 0], pairs[:, 1], between, np.array(information).reshape(-1, 6, 6)
-    )
+    edges = graph.Edges(pairs[:, 0], pairs[:, 1], between, np.array(information).reshape(-1, 6, 6))
     return graph.covariances(edges, poses, fixed)
 
 

@@ -45,9 +45,7 @@ def in_sequence(scans: Sequence[Scan], ahead: int = AHEAD) -> list[Try]:
     return _ordered(scans, places)
 
 
-def from_guesses(
-    tries: Iterable[Try], guesses: dict[int, Float[np.ndarray, "4 4"]]
-) -> list[Try]:
+def from_guesses(tries: Iterable[Try], guesses: dict[int, Float[np.ndarray, "4 4"]]) -> list[Try]:
     """The same pairs, started where guessed poses lay them, if both are guessed."""
     return [
         Try(pair.source, pair.target, np.linalg.inv(guesses[pair.target]) @ guesses[pair.source])
@@ -139,9 +137,7 @@ def _ordered(scans: Sequence[Scan], places: Iterable[tuple[Scan, Scan]]) -> list
     return sorted(tries, key=lambda pair: (pair.target, pair.source))
 
 
-def _overlap(
-    first: Scan, second: Scan, first_pose: np.ndarray, second_pose: np.ndarray
-) -> float:
+def _overlap(first: Scan, second: Scan, first_pose: np.ndarray, second_pose: np.ndarray) -> float:
     """Share of the scan that lies on the other; the larger of the two shares."""
     reach = _REACH * max(first.spacing, second.spacing)
     shares = []
@@ -150,7 +146,5 @@ def _overlap(
         (second, first, twists.inverse(first_pose) @ second_pose),
     ):
         moved = motions.apply(motion, one.points[:_PROBED])
-        shares.append(
-            np.isfinite(other.tree.query(moved, distance_upper_bound=reach)[0]).mean()
-        )
+        shares.append(np.isfinite(other.tree.query(moved, distance_upper_bound=reach)[0]).mean())
     return float(max(shares))

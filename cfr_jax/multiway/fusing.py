@@ -51,9 +51,7 @@ class _Cubes:
     scan: Int[np.ndarray, " n"]
 
 
-def fuse(
-    placed: Iterable[tuple[int, PointCloud, Float[np.ndarray, "4 4"]]], voxel: float
-) -> Fused:
+def fuse(placed: Iterable[tuple[int, PointCloud, Float[np.ndarray, "4 4"]]], voxel: float) -> Fused:
     """The mean point of each cube with edges of length `voxel`.
 
     `placed` gives the index of each scan, its points, and the motion into the model's frame. Raises

@@ -120,9 +120,7 @@ def _agreeing(
     """Which of the others agree with one edge, once it has laid one component on the other."""
     source, target = edges.source[row], edges.target[row]
     laid = poses[target] @ edges.transform[row] @ twists.inverse(poses[source])
-    moved = np.where(
-        (labels == labels[source])[:, None, None], laid @ poses, poses
-    )
+    moved = np.where((labels == labels[source])[:, None, None], laid @ poses, poses)
     taken = edges.take(others)
     off = graph.residuals(taken, moved)
     # the edge that lays them is noisy itself, and moves what is far from it by more

@@ -72,9 +72,7 @@ class Registrar:
 
     def _outcomes(self, tries: list[Try], kind: int) -> Any:
         if kind != ANYWHERE:
-            return align_many(
-                (self._pair(each) for each in tries), ordered=False, **self._options
-            )
+            return align_many((self._pair(each) for each in tries), ordered=False, **self._options)
         single = {name: value for name, value in self._options.items() if name not in _OF_BATCHES}
         return (
             Outcome(row, align(*self._pair(each)[:2], initial="global", **single), None)

@@ -100,9 +100,7 @@ def names_of(clouds: Sequence[Any]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def load(
-    clouds: Sequence[Any], names: Sequence[str], *, seed: int
-) -> Iterator[Scan | LeftOut]:
+def load(clouds: Sequence[Any], names: Sequence[str], *, seed: int) -> Iterator[Scan | LeftOut]:
     """Each input as a scan, or why it cannot be one. A file is read and let go."""
     for index, (given, name) in enumerate(zip(clouds, names, strict=True)):
         try:

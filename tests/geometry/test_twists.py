@@ -48,9 +48,7 @@ def test_the_adjoint_carries_a_twist_through_a_motion(some):
     # when
     other = np.einsum("nij,nj->ni", twists.adjoint(motion), carried)
     # then
-    np.testing.assert_allclose(
-        motion @ twists.exp(carried), twists.exp(other) @ motion, atol=1e-10
-    )
+    np.testing.assert_allclose(motion @ twists.exp(carried), twists.exp(other) @ motion, atol=1e-10)
 
 
 def test_the_left_jacobian_is_that_of_finite_differences(some):

@@ -87,9 +87,7 @@ def test_a_wrong_loop_closure_of_a_chain_is_thrown_out():
 def test_two_things_become_two_components_the_larger_first():
     # given
     small, large = some_poses(4, seed=1), some_poses(6, seed=2)
-    edges = together(
-        graph_of(small, noise=0.01), graph_of(large, noise=0.01, ahead=2), shift=4
-    )
+    edges = together(graph_of(small, noise=0.01), graph_of(large, noise=0.01, ahead=2), shift=4)
     # when
     found = placing.place(10, edges, *sure(edges))
     # then
@@ -106,7 +104,11 @@ def test_a_single_edge_places_a_scan_only_where_it_is_sure():
     )
     values, determined = sure(edges)
     # then
-    for confidence, open_, placed in ((0.6, False, False), (0.95, True, False), (0.95, False, True)):
+    for confidence, open_, placed in (
+        (0.6, False, False),
+        (0.95, True, False),
+        (0.95, False, True),
+    ):
         values[-1], determined[-1] = confidence, not open_
         found = placing.place(6, edges, values, determined)
         assert (found.component[5] == 0) == placed, (confidence, open_)
