@@ -64,11 +64,12 @@ class Merged:
 
     def pose(self, scan: int | str) -> Float[np.ndarray, "4 4"]:
         """The pose of a scan, by index or name. Raises KeyError for one that has none."""
-        index = self.names.index(scan) if isinstance(scan, str) and scan in self.names else scan
-        rows = np.flatnonzero(self.placed == index) if isinstance(index, int) else []
-        if not len(rows):
-            raise KeyError(f"scan {scan!r} has no pose")
-        return self.poses[rows[0]]
+        index = scan
+        if isinstance(scan, str):
+            index = self.names.index(scan) if scan in self.names else -1
+        for row in np.flatnonzero(self.placed == index):
+            return self.poses[row]
+        raise KeyError(f"scan {scan!r} has no pose")
 
     def by_component(self) -> Iterator[tuple[int, Int[np.ndarray, " k"]]]:
         """Each component, with the rows of its scans in `placed` and `poses`."""

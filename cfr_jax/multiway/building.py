@@ -90,11 +90,11 @@ def refined(scans: Sequence[Scan], built: Build) -> tuple[Build, Float[np.ndarra
     placement = built.placement
     poses = placement.poses.copy()
     spread = np.zeros((len(scans), 6, 6))
-    for label in np.unique(placement.component):
+    for label in np.unique(placement.component).tolist():
         rows = np.flatnonzero(placement.component == label)
         if len(rows) < 2:
             continue
-        members = [scans[row] for row in rows]
+        members = [scans[row] for row in rows.tolist()]
         pairs = _pairs(members, poses[rows], rows, built)
         fixed = np.arange(len(rows)) == 0
         poses[rows] = joint.refine(members, poses[rows], pairs, fixed)

@@ -65,8 +65,11 @@ def fuse(placed: Iterable[tuple[int, PointCloud, Float[np.ndarray, "4 4"]]], vox
         points = motions.apply(pose, cloud.points)
         if origin is None:
             origin = np.floor(points.mean(axis=0) / voxel) * voxel
-        bare |= cloud.normals is None
-        normals = np.zeros_like(points) if bare else motions.rotate(pose, cloud.normals)
+        normals = np.zeros_like(points)
+        if cloud.normals is None:
+            bare = True
+        else:
+            normals = motions.rotate(pose, cloud.normals)
         held.append(_cubes(index, points - origin, normals, voxel))
         waiting += len(held[-1].count)
         if waiting > _COMPACTED:

@@ -152,12 +152,16 @@ def _check(
 def _read(
     clouds: Sequence[Any], names: Sequence[str], seed: int, progress: bool
 ) -> tuple[list[Scan], list[LeftOut]]:
-    scans, left_out = [], []
+    scans: list[Scan] = []
+    left_out: list[LeftOut] = []
     loaded = load(clouds, names, seed=seed)
     for each in Progress(
         loaded, total=len(clouds), desc="reading", unit=" scans", disable=not progress
     ):
-        (scans if isinstance(each, Scan) else left_out).append(each)  # type: ignore[arg-type]
+        if isinstance(each, Scan):
+            scans.append(each)
+        else:
+            left_out.append(each)
     return scans, left_out
 
 
@@ -170,12 +174,12 @@ def _search(
     """Tries scans that are not in the largest component from all rotations, one after the other:
     a search takes some times as long, and a scan that has found its place needs no other."""
     built = build(scans, tries, records)
-    for row in np.flatnonzero(built.placement.component > 0):
+    for row in np.flatnonzero(built.placement.component > 0).tolist():
         if built.placement.component[row] == 0:
             continue
         others = np.flatnonzero(built.placement.component != built.placement.component[row])
         sure = 0
-        for other in others:
+        for other in others.tolist():
             [pair] = choosing.all_pairs([scans[row], scans[other]])
             tries, records = [*tries, pair], [*records, *registrar.records([pair], ANYWHERE)]
             sure += (records[-1]["confidence"] or 0.0) >= SURE
@@ -191,7 +195,7 @@ def _closures(scans: Sequence[Scan], tries: Sequence[Try], built: Build) -> list
     placement = built.placement
     for label in np.unique(placement.component):
         rows = np.flatnonzero(placement.component == label)
-        members = [scans[row] for row in rows]
+        members = [scans[row] for row in rows.tolist()]
         made += choosing.brought_together(members, placement.poses[rows], known, _CLOSING)
     return made
 

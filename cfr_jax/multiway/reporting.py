@@ -37,7 +37,7 @@ def answer(
     # a component may lose so many scans that hardly one is left
     held &= np.bincount(placement.component, held, len(sizes))[placement.component] > 1
     missing = list(left_out)
-    for row in np.flatnonzero(~held):
+    for row in np.flatnonzero(~held).tolist():
         reason = _reason(row, scans, built, open_=sizes[placement.component[row]] > 1)
         missing.append(LeftOut(scans[row].index, scans[row].name, reason))
     poses, references, labels = _in_frames(scans, built, held, reference)
@@ -74,7 +74,7 @@ def _in_frames(
     counts = np.bincount(placement.component[held], minlength=placement.component.max() + 1)
     references = []
     for number, label in enumerate(sorted(np.flatnonzero(counts), key=lambda k: (-counts[k], k))):
-        rows = np.flatnonzero(held & (placement.component == label))
+        rows = np.flatnonzero(held & (placement.component == label)).tolist()
         labels[rows] = number
         chosen = next((row for row in rows if scans[row].index == reference), rows[0])
         references.append(scans[chosen].index)

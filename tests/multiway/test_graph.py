@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from multiway_samples import first_only, distances, graph_of, some_poses
+from multiway_samples import distances, first_only, graph_of, some_poses
 from scipy.stats import chi2
 
 from cfr_jax.geometry import twists
