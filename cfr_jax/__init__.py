@@ -17,6 +17,7 @@ __all__ = [
     "Cloud",
     "CloudFileError",
     "Encoded",
+    "Merged",
     "Outcome",
     "PointCloud",
     "Registration",
@@ -26,6 +27,7 @@ __all__ = [
     "align_many",
     "encode",
     "load_params",
+    "merge",
     "prepare",
     "register",
     "save_params",
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
     from cfr_jax.alignment.answers import Alignment
     from cfr_jax.batch.stream import Outcome, align_many
     from cfr_jax.io import CloudFileError, PointCloud
+    from cfr_jax.multiway.answers import Merged
+    from cfr_jax.multiway.merging import merge
     from cfr_jax.networks.cfr.iterations import Encoded
     from cfr_jax.networks.cfr.registration import Registration, encode, register
     from cfr_jax.networks.inputs import Cloud, Settings, prepare
@@ -50,6 +54,8 @@ else:
         "align": "alignment.align",
         "Outcome": "batch.stream",
         "align_many": "batch.stream",
+        "Merged": "multiway.answers",
+        "merge": "multiway.merging",
         "Cloud": "networks.inputs",
         "Encoded": "networks.cfr.iterations",
         "Registration": "networks.cfr.registration",

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from cfr_jax.geometry import motions, twists
 from cfr_jax.multiway.graph import Edges
+from cfr_jax.multiway.scans import Scan, load
 
 
 def some_poses(count: int, seed: int) -> np.ndarray:
@@ -68,3 +69,38 @@ def distances(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 def all_pairs(count: int) -> list[tuple[int, int]]:
     """Each two of `count` scans."""
     return list(itertools.combinations(range(count), 2))
+
+
+def scans_of_a_solid(count: int, seed: int, flat: bool = False) -> tuple[list[Scan], np.ndarray]:
+    """Scans of one box with a corner cut out (or of a plane), each turned its own way, and the
+    poses of the centered scans in the frame of the first."""
+    rng = np.random.default_rng(seed)
+    poses = some_poses(count, seed)
+    clouds = []
+    for pose in poses:
+        drawn = rng.uniform(-1, 1, (4000, 3)) * (1.0, 0.7, 0.5)
+        if flat:
+            points = drawn[:2000] * (1, 1, 0)
+        else:
+            sides = np.array((1.0, 0.7, 0.5))
+            axis = rng.integers(3, size=len(drawn))
+            rows = np.arange(len(drawn))
+            drawn[rows, axis] = sides[axis] * rng.choice([-1.0, 1.0], len(drawn))
+            points = drawn[(drawn > 0).sum(axis=1) < 3]
+        points = points + rng.normal(0, 0.003, points.shape)
+        back = np.eye(4) if flat else motions.inverse(pose)
+        clouds.append(motions.apply(back, points))
+    scans = [
+        scan
+        for scan in load(clouds, [f"scan {row}" for row in range(count)], seed=0)
+        if isinstance(scan, Scan)
+    ]
+    centered = np.stack(
+        [
+            motions.inverse(motions.motion(np.eye(3), scans[0].center))
+            @ pose
+            @ motions.motion(np.eye(3), scan.center)
+            for pose, scan in zip(poses, scans, strict=True)
+        ]
+    )
+    return scans, centered

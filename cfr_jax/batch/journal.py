@@ -13,22 +13,29 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-FORMAT = "cfr_jax/batch/1"
 Key = tuple[str, str, int]
 
 
 class Journal:
     """An open journal; close it, or use it in a `with` statement."""
 
-    def __init__(self, path: Path, made_with: dict[str, Any], retry: bool = False):
+    def __init__(
+        self,
+        path: Path,
+        made_with: dict[str, Any],
+        retry: bool = False,
+        command: str = "batch",
+    ):
         """Opens the journal at `path`, or creates it.
 
-        With `retry`, pairs that failed count as not done. Raises ValueError if another process has
-        the file open, if it was made with other settings, or if it is not a journal.
+        With `retry`, pairs that failed count as not done. `command` of `cfr` writes it. Raises
+        ValueError if another process has the file open, if it was made with other settings, or if
+        it is not a journal.
         """
-        self.path = path
+        self.path, self._command = path, command
+        self._format = f"cfr_jax/{command}/1"
         self.done: dict[Key, dict[str, Any]] = {}
-        header = {"format": FORMAT, "made_with": made_with}
+        header = {"format": self._format, "made_with": made_with}
         self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             self._lock()
@@ -59,9 +66,9 @@ class Journal:
         """
         records = _records(path)
         header = next(records, {})
-        if header.get("format") != FORMAT or "made_with" not in header:
+        if header.get("format") != self._format or "made_with" not in header:
             raise ValueError(
-                f"{path} exists, but is not a journal of `cfr batch`\n"
+                f"{path} exists, but is not a journal of `cfr {self._command}`\n"
                 "move it, or choose another --out"
             )
         theirs = header["made_with"]
@@ -106,7 +113,7 @@ class Journal:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ValueError(
-                f"{self.path} is being written by another `cfr batch`\n"
+                f"{self.path} is being written by another `cfr {self._command}`\n"
                 "wait for it, choose another --out, or split the work with --shard"
             ) from None
         except OSError:  # file systems without locks

@@ -20,6 +20,7 @@ from cfr_jax.cli import (
     data,
     demo,
     export,
+    merge,
     models,
     register,
     reproduce,
@@ -29,6 +30,7 @@ from cfr_jax.cli import (
 _COMMANDS = (
     register,
     batch,
+    merge,
     view,
     demo,
     models,

@@ -14,7 +14,6 @@ from cfr_jax.data import kinds
 if TYPE_CHECKING:
     from cfr_jax.batch.jobs import Job
     from cfr_jax.batch.journal import Journal
-    from cfr_jax.batch.sharding import Shard
     from cfr_jax.networks.record import Params
 
 UNTRUSTED = 3
@@ -131,11 +130,12 @@ def run(args: argparse.Namespace) -> int:
     clouds.columns_of(args)
 
     from cfr_jax.batch.jobs import jobs_of
+    from cfr_jax.cli.shared.shares import asked_share
     from cfr_jax.data.layout import recognize
 
     layout = recognize(args.pairs, args.layout)
     jobs, how = jobs_of(layout, args.target)
-    shard = _shard(args.shard)
+    shard = asked_share(args.shard)
     print(f"recognized  {layout}")
     print(f"pairs       {len(jobs)}: {how}")
     out = args.out
@@ -229,28 +229,3 @@ def _tell(records: list[dict[str, Any]], out: Path, kept: Path, strict: bool) ->
             f"fix the files and add --retry-failed; every reason is in {out}"
         )
     return UNTRUSTED if strict and trusted < len(records) else 0
-
-
-def _shard(wish: str | None) -> Shard | None:
-    from cfr_jax.batch.sharding import parse_shard, process_shard
-
-    if wish is None:
-        return None
-    if wish != "auto":
-        try:
-            return parse_shard(wish)
-        except ValueError as error:
-            raise ValueError(f"--shard: {error}") from None
-
-    import jax
-
-    try:
-        if not jax.distributed.is_initialized():
-            jax.distributed.initialize()
-    except (ValueError, RuntimeError) as error:
-        raise ValueError(
-            "--shard auto: found no cluster that gives this process a number; give --shard I/N "
-            "instead\n"
-            f"({str(error).splitlines()[0]})"
-        ) from None
-    return process_shard()

@@ -15,7 +15,8 @@ from cfr_jax.multiway.scans import Scan
 _FLOOR = 0.25
 _LEAST_SPREAD = 0.05  # of the spacing: exact copies have no residuals, and still are not certain
 _AGREEING = 0.5  # cosine between two normals of one surface; their signs may differ
-_POINTWISE = 1e-5  # share of point-to-point information: keeps the matrix regular
+# What chance alone holds, in standard deviations: less than this says nothing of a direction.
+_CHANCE = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +28,8 @@ class Contact:
     the motion becomes transform @ exp(d)."""
     target_rows: Float[np.ndarray, "k 6"]
     """The same for a twist of the target, in the target's frame."""
+    source_rows: Float[np.ndarray, "k 6"]
+    """As `rows`, with the normals of the source's own planes."""
     heights: Float[np.ndarray, " k"]
     """Signed distances of the source's points to the planes of the target's."""
     share: float
@@ -48,12 +51,14 @@ def touching(
     planes = target.normals[index[near]]
     along = np.einsum("ij,ij->i", motions.rotate(transform, normals[near]), planes)
     agreeing = np.abs(along) >= _AGREEING
-    near, planes = near[agreeing], planes[agreeing]
+    near, planes, along = near[agreeing], planes[agreeing], along[agreeing]
+    own = np.sign(along)[:, None] * normals[near]
     moved, partners = moved[near], target.points[index[near]]
     inside = planes @ transform[:3, :3]  # the planes' normals in the source's frame
     return Contact(
         np.concatenate([np.cross(points[near], inside), inside], axis=1),
         -np.concatenate([np.cross(moved, planes), planes], axis=1),
+        np.concatenate([np.cross(points[near], own), own], axis=1),
         np.einsum("ij,ij->i", moved - partners, planes),
         len(near) / max(len(points), 1),
     )
@@ -64,17 +69,26 @@ def information(
 ) -> tuple[Float[np.ndarray, "6 6"], float]:
     """The information matrix of a motion (see `graph.Edges`), and the RMS distance to the planes.
 
-    It is that of point-to-plane least squares, with a floor under the variances. Directions that
-    no plane holds (along a corridor, around an axis) have next to no information.
+    It is that of point-to-plane least squares, with a floor under the variances. A direction that
+    no plane holds (along a corridor, about an axis) is as uncertain as the scan is large. Noise in
+    the normals would hide that: so each pair of points counts with the normals of both scans, whose
+    noise has nothing in common, and what is left is compared with chance.
     """
     found = touching(source, target, transform, reach, most)
     spacing = max(source.spacing, target.spacing)
-    # the median absolute deviation of normal noise, times this, is its standard deviation
-    spread = 1.4826 * float(np.median(np.abs(found.heights))) if len(found.heights) else reach
-    spread = max(spread, _LEAST_SPREAD * spacing)
-    arm = np.sqrt(np.mean(np.sum(source.points[:most] ** 2, axis=1)))
+    count = len(found.heights)
+    arm = float(np.sqrt(np.mean(np.sum(source.points[:most] ** 2, axis=1))))
     size = np.array([arm, arm, arm, 1.0, 1.0, 1.0])
-    held = found.rows.T @ found.rows + _POINTWISE * max(len(found.heights), 1) * np.diag(size**2)
-    covariance = spread**2 * np.linalg.inv(held) + np.diag((_FLOOR * spacing / size) ** 2)
-    rms = float(np.sqrt(np.mean(found.heights**2))) if len(found.heights) else float("inf")
-    return np.linalg.inv(covariance), rms
+    if not count:
+        return np.diag((size / arm) ** 2), float("inf")
+    # the median absolute deviation of normal noise, times this, is its standard deviation
+    spread = 1.4826 * float(np.median(np.abs(found.heights)))
+    spread = max(spread, _LEAST_SPREAD * spacing)
+    first, second = found.rows / size, found.source_rows / size
+    held = (first.T @ second + second.T @ first) / 2
+    chance = _CHANCE * float(np.mean((first - second) ** 2)) / 2 * np.sqrt(count)
+    values, directions = np.linalg.eigh(held)
+    variance = np.where(values > chance, spread**2 / np.maximum(values, 1e-12), arm**2)
+    covariance = (directions * variance) @ directions.T + (_FLOOR * spacing) ** 2 * np.eye(6)
+    covariance = covariance / np.outer(size, size)
+    return np.linalg.inv(covariance), float(np.sqrt(np.mean(found.heights**2)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -79,21 +80,6 @@ def merge(
     began = time.perf_counter()
     clouds = list(clouds)
     _check(clouds, guesses, reference, voxel)
-    names = names_of(clouds)
-    seconds: dict[str, float] = {}
-    scans, left_out = _read(clouds, names, seed, progress)
-    copies = twins(scans)
-    foreign = of_other_sizes(scans)
-    left_out += foreign
-    apart = {each.index for each in foreign} | copies.keys()
-    usable = [scan for scan in scans if scan.index not in apart]
-    if len(usable) < 2:
-        reasons = "; ".join(f"{each.name}: {each.reason}" for each in left_out[:2])
-        raise ValueError(f"clouds: wanted at least two scans that can be merged ({reasons})")
-    seconds["read"] = time.perf_counter() - began
-
-    started = time.perf_counter()
-    by_index = {scan.index: scan for scan in usable}
     options = {
         "params": params,
         "max_points": max_points,
@@ -101,11 +87,11 @@ def merge(
         "batch": batch,
         "workers": workers,
     }
-    registrar = Registrar(by_index, kept or Memory(), options, progress=progress)
-    tries = choosing.in_sequence(usable) if sequence else choosing.all_pairs(usable)
-    if guesses is not None:
-        known = {index: pose for index, pose in enumerate(guesses) if pose is not None}
-        tries = choosing.from_guesses(tries, known)
+    start = _start(clouds, options, sequence, guesses, kept or Memory(), progress)
+    usable, registrar, tries = start.scans, start.registrar, start.tries
+    seconds = {"read": time.perf_counter() - began}
+
+    started = time.perf_counter()
     records = registrar.records(tries, NEAR)
     built = build(usable, tries, records)
     if everywhere and built.placement.component.any():
@@ -120,11 +106,84 @@ def merge(
     seconds["refine"] = time.perf_counter() - started
 
     started = time.perf_counter()
-    found = answer(names, usable, built, covariances, left_out, copies, reference)
-    models = _fused(clouds, scans, found, copies, voxel, progress) if fused else ()
+    found = answer(start.names, usable, built, covariances, start.left_out, start.copies, reference)
+    models = _fused(clouds, usable, found, start.copies, voxel, progress) if fused else ()
     seconds["fuse"] = time.perf_counter() - started
     seconds["total"] = time.perf_counter() - began
     return dataclasses.replace(found, clouds=models, seconds=seconds)
+
+
+def register_share(
+    clouds: Sequence[Any],
+    rows: slice,
+    *,
+    kept: Kept,
+    params: dict | None = None,
+    sequence: bool = False,
+    guesses: Sequence[Float[np.ndarray, "4 4"] | None] | None = None,
+    max_points: int | None = None,
+    seed: int = 0,
+    batch: int | None = None,
+    workers: int | None = None,
+    progress: bool = False,
+) -> int:
+    """Registers only some of the pairs that `merge` would begin with; says how many.
+
+    `rows` are these among all pairs, as `batch.sharding.Shard.rows` gives them. What `kept` then
+    holds, `merge` need not register again.
+    """
+    clouds = list(clouds)
+    _check(clouds, guesses, None, None)
+    options = {
+        "params": params,
+        "max_points": max_points,
+        "seed": seed,
+        "batch": batch,
+        "workers": workers,
+    }
+    start = _start(clouds, options, sequence, guesses, kept, progress)
+    return len(start.registrar.records(start.tries[rows], NEAR))
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """What is known before anything is registered."""
+
+    names: tuple[str, ...]
+    scans: list[Scan]
+    """Those that can be registered."""
+    left_out: list[LeftOut]
+    copies: dict[int, int]
+    registrar: Registrar
+    tries: list[Try]
+
+
+def _start(
+    clouds: list[Any],
+    options: dict[str, Any],
+    sequence: bool,
+    guesses: Sequence[Float[np.ndarray, "4 4"] | None] | None,
+    kept: Kept,
+    progress: bool,
+) -> _Start:
+    names = names_of(clouds)
+    scans, left_out = _read(clouds, names, options["seed"], progress)
+    copies = twins(scans)
+    foreign = of_other_sizes(scans)
+    left_out += foreign
+    apart = {each.index for each in foreign} | copies.keys()
+    usable = [scan for scan in scans if scan.index not in apart]
+    if len(usable) < 2:
+        reasons = "; ".join(f"{each.name}: {each.reason}" for each in left_out[:2])
+        raise ValueError(
+            "clouds: wanted at least two scans that can be merged" + f" ({reasons})" * bool(reasons)
+        )
+    registrar = Registrar({s.index: s for s in usable}, kept, options, progress=progress)
+    tries = choosing.in_sequence(usable) if sequence else choosing.all_pairs(usable)
+    if guesses is not None:
+        known = {index: pose for index, pose in enumerate(guesses) if pose is not None}
+        tries = choosing.from_guesses(tries, known)
+    return _Start(names, usable, left_out, copies, registrar, tries)
 
 
 def _check(

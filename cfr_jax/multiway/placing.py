@@ -1,8 +1,9 @@
 """From edges to poses: which edges to build on, which scans belong together, where each lies.
 
-An edge is built on where a cycle of three confirms it, or where its confidence is high and no
-cycle of such edges speaks against it. Parts of a model that are found so are put together where two
-edges between them agree. What is then not connected stays apart.
+Only motions that the scans determine count. An edge is built on where a cycle of three confirms
+it, or where its confidence is high and no cycle of such edges speaks against it. Parts of a model
+that are found so are put together where two edges between them agree. What is then not connected
+stays apart.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def place(
             rejected[np.flatnonzero(held)[~agreeing]] = True
             held &= ~rejected
             continue
-        open_ = ~held & ~rejected & (confidence >= POSSIBLE)
+        open_ = determined & ~held & ~rejected & (confidence >= POSSIBLE)
         more = agreeing_between(edges, poses, labels, open_)
         if not more.any():
             break
@@ -77,7 +78,8 @@ def build_on(
     edges: Edges, confidence: Float[np.ndarray, " e"], determined: Bool[np.ndarray, " e"]
 ) -> Bool[np.ndarray, " e"]:
     """Which edges are good enough to give scans their places."""
-    possible = confidence >= POSSIBLE
+    # what slides or turns freely closes cycles by chance: it stays about where it lay
+    possible = determined & (confidence >= POSSIBLE)
     strong = np.zeros(len(edges), bool)
     rows = np.flatnonzero(possible)
     found = cycles.triangles(edges.take(rows))

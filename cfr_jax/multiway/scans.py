@@ -109,7 +109,7 @@ def load(clouds: Sequence[Any], names: Sequence[str], *, seed: int) -> Iterator[
                 raise ValueError(f"got {len(cloud)} points, wanted at least {_NEIGHBORS + 1}")
             frames = units.unit_frames(cloud, cloud, None)
         except (ValueError, OSError) as error:
-            yield LeftOut(index, name, str(error))
+            yield LeftOut(index, name, str(error).removeprefix(f"{name}: "))
             continue
         rows = units.subsample(cloud.points, KEPT, seed)
         normals = None if cloud.normals is None else cloud.normals[rows]

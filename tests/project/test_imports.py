@@ -22,6 +22,7 @@ ROOMS = (
     "alignment",  # two clouds in, a motion and what it is worth out
     "viewer",  # the page, the picture, recordings
     "batch",  # many pairs
+    "multiway",  # many scans of one thing: pairs chosen, poses solved, one cloud
     "evaluation",  # methods side by side; metrics, baselines
     "training",  # step, loop, checkpoints, reports
     "cli",  # one file per command

@@ -1,4 +1,4 @@
-"""Whole numbers as arguments, with clear error messages."""
+"""Numbers as arguments, with clear error messages."""
 
 from __future__ import annotations
 
@@ -13,6 +13,17 @@ def positive(text: str) -> int:
 def not_negative(text: str) -> int:
     """The text as a whole number of at least 0; raises ArgumentTypeError for anything else."""
     return _whole(text, 0)
+
+
+def positive_real(text: str) -> float:
+    """The text as a number above 0; raises ArgumentTypeError for anything else."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"got {text!r}, wanted a number above 0")
+    return value
 
 
 def _whole(text: str, least: int) -> int:
