@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import solids
 from scipy.spatial.transform import Rotation
 
 from cfr_jax.geometry import motions, twists
@@ -104,3 +105,23 @@ def scans_of_a_solid(count: int, seed: int, flat: bool = False) -> tuple[list[Sc
         ]
     )
     return scans, centered
+
+
+def views_of_a_solid(
+    count: int, points: int = 420, seed: int = 0
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Scans of the lopsided solid, each without the fifth that faces away from it, and the motions
+    that bring them back."""
+    rng = np.random.default_rng(seed)
+    clouds, poses = [], []
+    for row in range(count):
+        cloud = solids.lopsided(2 * points, seed + row, 0.002).points
+        direction = Rotation.from_euler("z", 360 * row / count, degrees=True).apply((1.0, 0.3, 0.2))
+        along = cloud @ direction
+        cloud = cloud[along > np.quantile(along, 0.2)][:points]
+        pose = motions.motion(
+            Rotation.from_rotvec(rng.uniform(-0.4, 0.4, 3)).as_matrix(), rng.uniform(-1, 1, 3)
+        )
+        clouds.append(motions.apply(motions.inverse(pose), cloud))
+        poses.append(pose)
+    return clouds, np.stack(poses)

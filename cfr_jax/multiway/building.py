@@ -32,10 +32,17 @@ class Build:
     failures: tuple[tuple[int, int, str], ...]
     """Pairs that could not be registered at all, and why."""
     placement: Placement
+    ambiguous: Bool[np.ndarray, " n"]
+    """Scans that fit together in more than one way: none of their places is sure."""
 
 
-def build(scans: Sequence[Scan], tries: Sequence[Try], records: Sequence[Record]) -> Build:
-    """Poses from registered pairs. Of several records of two scans, the most confident counts."""
+def build(
+    scans: Sequence[Scan], tries: Sequence[Try], records: Sequence[Record], *, alone: bool
+) -> Build:
+    """Poses from registered pairs. Of several records of two scans, the most confident counts.
+
+    `alone` is that of `placing.place`.
+    """
     row_of = {scan.index: row for row, scan in enumerate(scans)}
     best: dict[frozenset[int], tuple[Try, Record]] = {}
     failures = []
@@ -63,13 +70,17 @@ def build(scans: Sequence[Scan], tries: Sequence[Try], records: Sequence[Record]
     )
     confidence = np.array([_sureness(record) for _, record in best.values()], np.float64)
     determined = np.array([record["determined"] for _, record in best.values()], bool)
+    placement = placing.place(len(scans), edges, confidence, determined, alone=alone)
+    radius = float(np.median([scan.radius for scan in scans]))
+    others = placing.share_of_others(edges, placement, confidence, determined, radius)
     return Build(
         tuple(record for _, record in best.values()),
         edges,
         confidence,
         determined,
         tuple(failures),
-        placing.place(len(scans), edges, confidence, determined),
+        placement,
+        (others > placing.MOST_OTHERS)[placement.component],
     )
 
 
@@ -81,11 +92,13 @@ def measured(
     return contact.information(source, target, transform, reach)
 
 
-def refined(scans: Sequence[Scan], built: Build) -> tuple[Build, Float[np.ndarray, "n 6 6"]]:
+def refined(
+    scans: Sequence[Scan], built: Build, reference: int | None
+) -> tuple[Build, Float[np.ndarray, "n 6 6"]]:
     """The same, with each component refined as a whole, and the covariance of each pose.
 
     The covariance is that of a pose graph of all pairs that were refined together, each with the
-    information of its surfaces.
+    information of its surfaces, relative to the `reference`, or to the first scan of a component.
     """
     placement = built.placement
     poses = placement.poses.copy()
@@ -96,7 +109,9 @@ def refined(scans: Sequence[Scan], built: Build) -> tuple[Build, Float[np.ndarra
             continue
         members = [scans[row] for row in rows.tolist()]
         pairs = _pairs(members, poses[rows], rows, built)
-        fixed = np.arange(len(rows)) == 0
+        fixed = np.array([scan.index == reference for scan in members])
+        if not fixed.any():
+            fixed[0] = True
         poses[rows] = joint.refine(members, poses[rows], pairs, fixed)
         spread[rows] = _covariances(members, poses[rows], pairs, fixed)
     return dataclasses.replace(built, placement=dataclasses.replace(placement, poses=poses)), spread

@@ -93,16 +93,17 @@ def merge(
 
     started = time.perf_counter()
     records = registrar.records(tries, NEAR)
-    built = build(usable, tries, records)
+    alone = sequence or len(usable) == 2
+    built = build(usable, tries, records, alone=alone)
     if everywhere and built.placement.component.any():
-        tries, records, built = _search(usable, registrar, tries, records)
+        tries, records, built = _search(usable, registrar, tries, records, alone)
     if loop_closures and (more := _closures(usable, tries, built)):
         records = records + registrar.records(more, CLOSURE)
-        built = build(usable, tries + more, records)
+        built = build(usable, tries + more, records, alone=alone)
     seconds["register"] = time.perf_counter() - started
 
     started = time.perf_counter()
-    built, covariances = refined(usable, built)
+    built, covariances = refined(usable, built, reference)
     seconds["refine"] = time.perf_counter() - started
 
     started = time.perf_counter()
@@ -229,10 +230,11 @@ def _search(
     registrar: Registrar,
     tries: list[Try],
     records: list[Record],
+    alone: bool,
 ) -> tuple[list[Try], list[Record], Build]:
     """Tries scans that are not in the largest component from all rotations, one after the other:
     a search takes some times as long, and a scan that has found its place needs no other."""
-    built = build(scans, tries, records)
+    built = build(scans, tries, records, alone=alone)
     for row in np.flatnonzero(built.placement.component > 0).tolist():
         if built.placement.component[row] == 0:
             continue
@@ -244,7 +246,7 @@ def _search(
             sure += (records[-1]["confidence"] or 0.0) >= SURE
             if sure >= _ENOUGH:
                 break
-        built = build(scans, tries, records)
+        built = build(scans, tries, records, alone=alone)
     return tries, records, built
 
 

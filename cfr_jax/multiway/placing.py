@@ -1,9 +1,9 @@
 """From edges to poses: which edges to build on, which scans belong together, where each lies.
 
 Only motions that the scans determine count. An edge is built on where a cycle of three confirms
-it, or where its confidence is high and no cycle of such edges speaks against it. Parts of a model
-that are found so are put together where two edges between them agree. What is then not connected
-stays apart.
+it; however confident it is alone, it may be the other way in which a nearly symmetric thing fits.
+Parts of a model that are found so are put together where two edges between them agree. What is then
+not connected stays apart.
 """
 
 from __future__ import annotations
@@ -21,7 +21,13 @@ from cfr_jax.multiway import cycles, graph, robust
 from cfr_jax.multiway.graph import Edges
 from cfr_jax.multiway.robust import LIMIT
 
-SURE = 0.9  # confidence that needs nobody's confirmation
+SURE = 0.9  # confidence that needs no confirmation, where there can be none
+TRUSTED = 0.5
+# An edge that leaves its scan so far from where the poses lay it is another answer, and no error.
+_FAR_TURN, _FAR_PLACE = np.radians(15.0), 0.15  # of a radius
+# Of trusted edges, by confidence, that are other answers: of 10 shapes whose scans were placed
+# right, 5 % at most, of those where they fit in two ways and were placed wrong, 20 % at least.
+MOST_OTHERS = 0.12
 POSSIBLE = 0.1  # below this, an edge is not looked at
 
 
@@ -44,9 +50,15 @@ def place(
     edges: Edges,
     confidence: Float[np.ndarray, " e"],
     determined: Bool[np.ndarray, " e"],
+    *,
+    alone: bool = False,
 ) -> Placement:
-    """Poses for `count` scans. At most one edge may connect two scans."""
-    strong = build_on(edges, confidence, determined)
+    """Poses for `count` scans. At most one edge may connect two scans.
+
+    With `alone`, an edge of high confidence needs no cycle: where the order of the scans says that
+    it should be there, or where two scans are all.
+    """
+    strong = build_on(edges, confidence, determined, alone=alone)
     closing, having = cycles.votes(edges)
     order = cycles.confirmed_order(closing, having, confidence)
     held, rejected = strong.copy(), np.zeros(len(edges), bool)
@@ -75,9 +87,16 @@ def place(
 
 
 def build_on(
-    edges: Edges, confidence: Float[np.ndarray, " e"], determined: Bool[np.ndarray, " e"]
+    edges: Edges,
+    confidence: Float[np.ndarray, " e"],
+    determined: Bool[np.ndarray, " e"],
+    *,
+    alone: bool,
 ) -> Bool[np.ndarray, " e"]:
-    """Which edges are good enough to give scans their places."""
+    """Which edges are good enough to give scans their places.
+
+    One that is sure and counts `alone` must not be in a cycle of sure edges that does not close.
+    """
     # what slides or turns freely closes cycles by chance: it stays about where it lay
     possible = determined & (confidence >= POSSIBLE)
     strong = np.zeros(len(edges), bool)
@@ -85,11 +104,37 @@ def build_on(
     found = cycles.triangles(edges.take(rows))
     good = cycles.closed(edges.take(rows), found)
     strong[rows[np.unique(found[good])]] = True
+    if not alone:
+        return strong
     sure = determined & (confidence >= SURE)
     against = ~good & sure[rows[found]].all(axis=1)
     doubted = np.zeros(len(edges), bool)
     doubted[rows[np.unique(found[against])]] = True
     return strong | (sure & ~doubted)
+
+
+def share_of_others(
+    edges: Edges,
+    placement: Placement,
+    confidence: Float[np.ndarray, " e"],
+    determined: Bool[np.ndarray, " e"],
+    radius: float,
+) -> Float[np.ndarray, " c"]:
+    """Of each component: how many of its trusted edges, by confidence, lay scans elsewhere.
+
+    Scans of a nearly symmetric thing fit together in several ways, and many edges tell of each of
+    them. Then nobody knows which is right.
+    """
+    labels = placement.component
+    off = graph.residuals(edges, placement.poses)
+    far = np.linalg.norm(off[:, :3], axis=1) > _FAR_TURN
+    far |= np.linalg.norm(off[:, 3:], axis=1) > _FAR_PLACE * radius
+    within = labels[edges.source] == labels[edges.target]
+    weight = confidence * (within & determined & (confidence >= TRUSTED))
+    count = labels.max() + 1
+    total = np.bincount(labels[edges.source], weight, count)
+    other = np.bincount(labels[edges.source], weight * far, count)
+    return other / np.maximum(total, 1e-12)
 
 
 def agreeing_between(

@@ -6,7 +6,7 @@ A target that many scans share is encoded once: `choosing` orders the pairs so.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from cfr_jax.alignment.align import align
 from cfr_jax.batch.jobs import Job
@@ -22,6 +22,7 @@ NEAR, CLOSURE, ANYWHERE = range(3)
 rotations. It tells the records of two scans apart."""
 
 
+@runtime_checkable
 class Kept(Protocol):
     """Where records are kept: `batch.journal.Journal` is one."""
 

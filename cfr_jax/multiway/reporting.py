@@ -33,12 +33,12 @@ def answer(
     free = np.array(
         [_freedom(scan, spread) for scan, spread in zip(scans, covariances, strict=True)]
     )
-    held = (sizes[placement.component] > 1) & (free <= _FREE)
+    held = (sizes[placement.component] > 1) & (free <= _FREE) & ~built.ambiguous
     # a component may lose so many scans that hardly one is left
     held &= np.bincount(placement.component, held, len(sizes))[placement.component] > 1
     missing = list(left_out)
     for row in np.flatnonzero(~held).tolist():
-        reason = _reason(row, scans, built, open_=sizes[placement.component[row]] > 1)
+        reason = _reason(row, scans, built, open_=bool(sizes[placement.component[row]] > 1))
         missing.append(LeftOut(scans[row].index, scans[row].name, reason))
     poses, references, labels = _in_frames(scans, built, held, reference)
     rows = {scans[row].index: row for row in np.flatnonzero(held).tolist()}
@@ -134,6 +134,8 @@ def _doubt(built: Build, row: int, together: bool) -> str:
 
 def _reason(row: int, scans: Sequence[Scan], built: Build, open_: bool) -> str:
     """Why a scan is left out."""
+    if built.ambiguous[row]:
+        return "the scans fit together in more than one way: too symmetric to tell which is right"
     if open_:
         return "nothing determines its place: it slides or turns freely on the others"
     edges = built.edges
@@ -141,8 +143,8 @@ def _reason(row: int, scans: Sequence[Scan], built: Build, open_: bool) -> str:
     if not len(own):
         failed = [reason for source, target, reason in built.failures if row in (source, target)]
         return failed[0] if failed else "it was registered with no other scan"
-    best = own[np.argmax(built.confidence[own])]
-    other = edges.target[best] if edges.source[best] == row else edges.source[best]
+    best = int(own[np.argmax(built.confidence[own])])
+    other = int(edges.target[best] if edges.source[best] == row else edges.source[best])
     return f"not sure of any place; best with {scans[other].name}: {_doubt(built, best, False)}"
 
 

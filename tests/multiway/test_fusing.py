@@ -72,7 +72,9 @@ def test_estimated_normals_of_a_ball_point_outward():
     assert np.quantile(along, 0.05) > 0.95
 
 
-@pytest.mark.parametrize(("voxel", "told"), [(0.0, "positive"), (np.nan, "positive"), (1e-9, "at least")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("voxel", "told"), [(0.0, "positive"), (np.nan, "positive"), (1e-9, "at least")]
+)
 def test_a_voxel_that_cannot_be_used_is_refused(voxel, told):
     cloud = io.PointCloud(np.random.default_rng(0).normal(size=(20, 3)))
     with pytest.raises(ValueError, match=f"voxel: .*{told}"):

@@ -96,22 +96,45 @@ def test_two_things_become_two_components_the_larger_first():
     assert distances(found.poses[:4], small).max() < 0.1
 
 
-def test_a_single_edge_places_a_scan_only_where_it_is_sure():
+def test_a_single_edge_places_a_scan_only_where_it_is_sure_and_may_count_alone():
     # given: a ring, and one more scan that hangs on one edge
     ring = some_poses(5, seed=3)
     edges = together(
         graph_of(ring, noise=0.01, ahead=2), graph_of(ring[:2], noise=0.01, ahead=1, ring=False), 4
     )
     values, determined = sure(edges)
-    # then
-    for confidence, open_, placed in (
-        (0.6, False, False),
-        (0.95, True, False),
-        (0.95, False, True),
+    for confidence, open_, alone, placed in (
+        (0.95, False, True, True),
+        (0.95, False, False, False),
+        (0.95, True, True, False),
+        (0.6, False, True, False),
     ):
         values[-1], determined[-1] = confidence, not open_
-        found = placing.place(6, edges, values, determined)
-        assert (found.component[5] == 0) == placed, (confidence, open_)
+        # when
+        found = placing.place(6, edges, values, determined, alone=alone)
+        # then
+        assert (found.component[5] == 0) == placed, (confidence, open_, alone)
+
+
+def test_a_thing_that_fits_in_two_ways_shows_in_its_edges():
+    # given: a shape that a half turn hardly changes; some edges are turned so, and agree
+    poses = some_poses(8, seed=2)
+    edges = graph_of(poses, noise=0.01)
+    turned = np.arange(0, len(edges), 3)
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    transform = edges.transform.copy()
+    transform[turned] = transform[turned] @ half
+    both = Edges(edges.source, edges.target, transform, edges.information)
+    values, determined = sure(edges)
+    # when
+    clear, doubtful = (
+        placing.share_of_others(each, found, values, determined, 1.0)[found.component]
+        for each in (edges, both)
+        for found in [placing.place(8, each, values, determined)]
+    )
+    # then
+    assert clear.max() == 0
+    assert doubtful.max() > placing.MOST_OTHERS
 
 
 def test_two_unsure_edges_that_agree_put_two_parts_together():
@@ -138,10 +161,11 @@ def test_two_unsure_edges_that_agree_put_two_parts_together():
     assert alone.component.max() == 1
 
 
-def test_an_unsure_edge_is_confirmed_by_a_cycle():
+def test_an_unsure_edge_is_confirmed_by_a_cycle_but_not_one_that_leaves_a_motion_open():
     poses = some_poses(3, seed=8)
     edges = graph_of(poses, noise=0.01, ahead=1)
-    low, open_ = np.full(3, 0.3), np.zeros(3, bool)
-    assert placing.place(3, edges, low, open_).kept.all()
+    low, yes, no = np.full(3, 0.3), np.ones(3, bool), np.zeros(3, bool)
+    assert placing.place(3, edges, low, yes).kept.all()
+    assert placing.place(3, edges, low, no).component.max() == 2
     broken = with_wrong(edges, np.array([1]), seed=3)
-    assert not placing.place(3, broken, low, open_).kept.any()
+    assert placing.place(3, broken, low, yes).component.max() == 2
