@@ -9,7 +9,7 @@ import solids
 from scipy.spatial.transform import Rotation
 
 from cfr_jax.geometry import motions, twists
-from cfr_jax.multiway.graph import Edges
+from cfr_jax.multiway.pose_graph.graph import Edges
 from cfr_jax.multiway.scans import Scan, load
 
 

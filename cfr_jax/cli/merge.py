@@ -13,6 +13,7 @@ from cfr_jax.io import formats
 
 if TYPE_CHECKING:
     from cfr_jax.multiway.answers import Merged
+    from cfr_jax.viewer import Layer
 
 INCOMPLETE = 3
 FORMAT = "cfr_jax/poses/1"
@@ -227,10 +228,10 @@ def _tell(found: Merged, args: argparse.Namespace, kept: Path) -> int:
     if args.poses is not None:
         _write_poses(found, args.poses)
         written.append(args.poses)
-    if args.view is not None:
-        from cfr_jax.viewer import write_model_page
+    if args.view is not None and found.clouds:
+        from cfr_jax.viewer import write_layers
 
-        write_model_page(args.view, *as_layers(found), title=args.out.stem)
+        write_layers(args.view, as_layers(found), title=args.out.stem)
         written.append(args.view)
     print(as_text(found))
     for path in (*written, kept):
@@ -261,6 +262,19 @@ def _write_poses(found: Merged, path: Path) -> None:
         if component == 0
     }
     write_poses(path, poses, found.names)
+
+
+def as_layers(found: Merged) -> list[Layer]:
+    """The points of the largest model, one layer for each scan, under its name."""
+    from cfr_jax.viewer import Layer
+
+    if not found.clouds:
+        return []
+    model = found.clouds[0]
+    return [
+        Layer(found.names[scan], model.points[model.scan == scan])
+        for scan in sorted(set(model.scan.tolist()))
+    ]
 
 
 def as_text(found: Merged) -> str:

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cfr_jax.multiway import choosing, contact, graph, joint, placing
+from cfr_jax.multiway import choosing, contact, joint
 from cfr_jax.multiway.choosing import Try
-from cfr_jax.multiway.placing import Placement
+from cfr_jax.multiway.pose_graph import graph, placing
+from cfr_jax.multiway.pose_graph.placing import Placement
 from cfr_jax.multiway.registering import Record
 from cfr_jax.multiway.scans import Scan
 

@@ -18,7 +18,7 @@ from cfr_jax.multiway.answers import Merged
 from cfr_jax.multiway.building import Build, build, refined
 from cfr_jax.multiway.choosing import Try
 from cfr_jax.multiway.fusing import Fused, fuse
-from cfr_jax.multiway.placing import SURE
+from cfr_jax.multiway.pose_graph.placing import SURE
 from cfr_jax.multiway.registering import (
     ANYWHERE,
     CLOSURE,

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cfr_jax.geometry import motions, twists
-from cfr_jax.multiway import choosing, placing
+from cfr_jax.multiway import choosing
 from cfr_jax.multiway.answers import Edge, Merged
 from cfr_jax.multiway.building import Build, measured
+from cfr_jax.multiway.pose_graph import placing
 from cfr_jax.multiway.scans import LeftOut, Scan
 
 # Of a scan's radius, standard deviation: where a scan may slide so far, its place is open.

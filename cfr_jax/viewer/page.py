@@ -36,16 +36,16 @@ def write_page(path: str | os.PathLike[str], scene: Scene, *, max_points: int = 
         raise ValueError(f"max_points: got {max_points!r}, wanted an integer >= 1")
     template = resources.files("cfr_jax.viewer").joinpath("page.html").read_text("utf-8")
     fills = {
-        "csp": _content_security_policy(template),
-        "title": _text_for_html(f"{scene.source_name} → {scene.target_name}"),
-        "scene": _json_for_html(_payload(scene, best_view(scene), max_points)),
+        "csp": content_security_policy(template),
+        "title": text_for_html(f"{scene.source_name} → {scene.target_name}"),
+        "scene": json_for_html(_payload(scene, best_view(scene), max_points)),
     }
     # In one pass, so that a name that looks like a placeholder is not replaced.
     page = re.sub(r"\{\{(csp|title|scene)\}\}", lambda match: fills[match[1]], template)
     write_atomically(path, page.encode())
 
 
-def _content_security_policy(template: str) -> str:
+def content_security_policy(template: str) -> str:
     """A policy that allows only the template's own script and style, by their hashes."""
     allowed = {
         tag: " ".join(
@@ -60,12 +60,12 @@ def _content_security_policy(template: str) -> str:
     )
 
 
-def _text_for_html(text: str) -> str:
+def text_for_html(text: str) -> str:
     """Escapes to plain ASCII, because a file name may hold bytes that no encoding can write."""
     return html.escape(text).encode("ascii", "xmlcharrefreplace").decode("ascii")
 
 
-def _json_for_html(value: dict[str, Any]) -> str:
+def json_for_html(value: dict[str, Any]) -> str:
     """JSON that cannot close the script element around it or open another one."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     for character in "<>&":
@@ -82,8 +82,8 @@ def _payload(scene: Scene, camera: Camera, max_points: int) -> dict[str, Any]:
     scale = float(camera.radii[-1])
     kept_source = _thin(len(scene.source), max_points, scene.weights)
     kept_target = _thin(len(scene.target), max_points, None)
-    source_center, source = _quantize(scene.source[kept_source], scale)
-    target_center, target = _quantize(scene.target[kept_target], scale)
+    source_center, source = quantized(scene.source[kept_source], scale)
+    target_center, target = quantized(scene.target[kept_target], scale)
     return {
         "source": {
             **source,
@@ -131,7 +131,7 @@ def _thin(
     return np.sort(order[:max_points])
 
 
-def _quantize(
+def quantized(
     points: Float64[np.ndarray, "n 3"], scale: float
 ) -> tuple[Float64[np.ndarray, " 3"], dict[str, Any]]:
     """The middle of the points, and their offsets from it as int16.

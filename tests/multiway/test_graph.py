@@ -8,7 +8,7 @@ from multiway_samples import distances, first_only, graph_of, some_poses
 from scipy.stats import chi2
 
 from cfr_jax.geometry import twists
-from cfr_jax.multiway import graph
+from cfr_jax.multiway.pose_graph import graph
 
 
 @pytest.fixture

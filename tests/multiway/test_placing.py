@@ -7,8 +7,8 @@ import pytest
 from multiway_samples import distances, graph_of, some_poses, with_wrong
 
 from cfr_jax.geometry import twists
-from cfr_jax.multiway import cycles, placing, robust
-from cfr_jax.multiway.graph import Edges
+from cfr_jax.multiway.pose_graph import cycles, placing, robust
+from cfr_jax.multiway.pose_graph.graph import Edges
 
 
 def together(first: Edges, second: Edges, shift: int) -> Edges:

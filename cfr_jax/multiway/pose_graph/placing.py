@@ -17,9 +17,9 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from cfr_jax.geometry import twists
-from cfr_jax.multiway import cycles, graph, robust
-from cfr_jax.multiway.graph import Edges
-from cfr_jax.multiway.robust import LIMIT
+from cfr_jax.multiway.pose_graph import cycles, graph, robust
+from cfr_jax.multiway.pose_graph.graph import Edges
+from cfr_jax.multiway.pose_graph.robust import LIMIT
 
 SURE = 0.9  # confidence that needs no confirmation, where there can be none
 TRUSTED = 0.5

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cfr_jax.geometry import twists
-from cfr_jax.multiway.graph import Edges
-from cfr_jax.multiway.robust import LIMIT
+from cfr_jax.multiway.pose_graph.graph import Edges
+from cfr_jax.multiway.pose_graph.robust import LIMIT
 
 
 def triangles(edges: Edges) -> Int[np.ndarray, "t 3"]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import chi2
 
-from cfr_jax.multiway.graph import Edges, chi_squares, solve
+from cfr_jax.multiway.pose_graph.graph import Edges, chi_squares, solve
 
 # Of right edges, one in ten thousand is further off than this many squared standard deviations.
 LIMIT = float(chi2.ppf(0.9999, df=6))

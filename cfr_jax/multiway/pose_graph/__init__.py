@@ -1,0 +1,1 @@
+"""Poses from measured motions: the graph, its wrong edges, and what hangs together."""
