@@ -28,7 +28,7 @@ _FAR_TURN, _FAR_PLACE = np.radians(15.0), 0.15  # of a radius
 # Of trusted edges, by confidence, that are other answers: of 10 shapes whose scans were placed
 # right, 5 % at most, of those where they fit in two ways and were placed wrong, 20 % at least.
 MOST_OTHERS = 0.12
-POSSIBLE = 0.1  # below this, an edge is not looked at
+POSSIBLE = 0.3  # below this, an edge is not looked at
 
 
 @dataclass(frozen=True, eq=False)
