@@ -1,4 +1,4 @@
-"""`cfr demo`: registers the pair that ships with the package, whose true motion is known."""
+"""`cfr demo`: registers what ships with the package, whose true motions are known."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ _DESCRIPTION = """\
 Registers two views that ship with the package: an object as a depth camera would see it from two
 places. Prints the motion, its quality, and its error against the known truth. Writes demo.png
 (before and after) and demo.html (to rotate in a browser) into a folder.
+
+With --merge, eight views around that object become one model, model.ply, shown in model.html.
 """
+_VIEWS = Path(__file__).parent / "demo_views"
 _PAIR = Path(__file__).parent / "demo_pair"
 
 
@@ -38,10 +41,15 @@ def add_parser(commands: Commands) -> None:
         default=Path("out"),
         help="folder for the pictures, created if missing (default: out)",
     )
+    parser.add_argument(
+        "--merge", action="store_true", help="merge eight views instead of registering two"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Registers the pair, prints the quality of the result, and draws it."""
+    """Registers the pair, or merges the views; prints how good the result is, and draws it."""
+    if args.merge:
+        return _merge(args.out)
     page, picture = args.out / "demo.html", args.out / "demo.png"
     args.out.mkdir(parents=True, exist_ok=True)
     for path in (page, picture):
@@ -73,6 +81,42 @@ def run(args: argparse.Namespace) -> int:
         print(f"wrote       {picture}")
     else:
         print(f'left out    {picture}: pictures need matplotlib: pip install "cfr_jax[viz]"')
+    return 0
+
+
+def _merge(folder: Path) -> int:
+    cloud, page = folder / "model.ply", folder / "model.html"
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in (cloud, page):
+        outputs.check_output("--out", path)
+
+    from cfr_jax import io, viewer
+    from cfr_jax.cli.merge import as_layers, as_text
+    from cfr_jax.cli.shared.cache import keep_compiled_programs
+    from cfr_jax.geometry import motions
+    from cfr_jax.multiway.merging import merge
+    from cfr_jax.multiway.pose_files import read_poses
+
+    keep_compiled_programs()
+    files = sorted(_VIEWS.glob("*.ply"))
+    names = [path.name for path in files]
+    truth = read_poses(_VIEWS / "poses.json", names)
+    print("Eight views all around a fork lift, each turned its own way.\n")
+    merged = merge(files, progress=True)
+    print(as_text(merged))
+    if merged.clouds:
+        first = motions.inverse(truth[names[merged.references[0]]])
+        angles = [
+            float(motions.angle_between(pose, first @ truth[names[index]]))
+            for index, pose, component in zip(
+                merged.placed.tolist(), merged.poses, merged.component.tolist(), strict=True
+            )
+            if component == 0
+        ]
+        print(f"error       {max(angles):.2f}° at most, against the known poses")
+        io.write(cloud, merged.clouds[0].as_cloud())
+        viewer.write_layers(page, as_layers(merged), title="fork lift")
+        print(f"\nwrote       {cloud}\nwrote       {page} (open it in a browser and rotate it)")
     return 0
 
 

@@ -74,3 +74,16 @@ def test_a_folder_that_cannot_be_made_is_told(place, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert main(["demo", "--out", str(tmp_path / place)]) == 2
     assert capsys.readouterr().err.count("\n") <= 3
+
+
+def test_the_demo_merges_its_views_into_one_model(tmp_path, capsys):
+    # when
+    code = main(["demo", "--merge", "--out", str(tmp_path)])
+
+    # then
+    out = capsys.readouterr().out
+    [angle] = re.findall(r"^error +([\d.]+)° at most", out, re.MULTILINE)
+    assert code == 0 and float(angle) < 1.0
+    assert re.search(r"^placed +8 of 8 scans$", out, re.MULTILINE)
+    assert len(io.read(tmp_path / "model.ply")) > 3000
+    assert "view7.ply" in (tmp_path / "model.html").read_text()

@@ -90,6 +90,9 @@ def test_the_wheel_holds_every_file_of_the_package_but_the_baseline_and_no_other
         "cli/demo_pair/target.ply",
         "cli/demo_pair/truth.json",
         "cli/demo_pair/LICENSE.md",
+        "cli/demo_views/view0.ply",
+        "cli/demo_views/poses.json",
+        "cli/demo_views/LICENSE.md",
     ],
 )
 def test_the_wheel_holds_what_is_opened_at_run_time(wheel, name):
