@@ -26,6 +26,8 @@ _PLOTS = flags.DEFINE_bool("plots", True, "Whether to draw plots and galleries."
 def main(_) -> None:
     """Reads the flags; the work is done in `cfr_jax.evaluation`."""
     from cfr_jax.evaluation.comparison import compare
+    from cfr_jax.evaluation.multiway.comparison import compare_merges
+    from cfr_jax.evaluation.multiway.config import MergeConfig
 
     logging.set_verbosity(logging.ERROR)  # JAX logs every backend that is missing
     config = _CONFIG.value
@@ -34,7 +36,10 @@ def main(_) -> None:
             setattr(config, name, flag.value)
     command = shlex.join(["python", *sys.argv])
     try:
-        print(compare(config, Path(_OUT.value), _METHODS.value, _PLOTS.value, command))
+        if isinstance(config, MergeConfig):
+            print(compare_merges(config, Path(_OUT.value), _METHODS.value, command))
+        else:
+            print(compare(config, Path(_OUT.value), _METHODS.value, _PLOTS.value, command))
     except (ValueError, ModuleNotFoundError) as error:
         sys.exit(f"evaluate.py: error: {error}")
 
