@@ -32,7 +32,8 @@ class Journal:
         ValueError if another process has the file open, if it was made with other settings, or if
         it is not a journal.
         """
-        self.path, self._command = path, command
+        self.path = path
+        self._command = command
         self._format = f"cfr_jax/{command}/1"
         self.done: dict[Key, dict[str, Any]] = {}
         header = {"format": self._format, "made_with": made_with}

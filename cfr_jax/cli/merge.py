@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cfr_jax.cli.shared import numbers, outputs
+from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.io import formats
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ examples:
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr merge`."""
     parser = commands.add_parser(
         "merge",

@@ -30,6 +30,7 @@ from cfr_jax.multiway.registering import (
 )
 from cfr_jax.multiway.reporting import answer
 from cfr_jax.multiway.scans import LeftOut, Scan, load, names_of, of_other_sizes, twins
+from cfr_jax.networks.record import Params
 from cfr_jax.runtime.progress import Progress
 
 _CLOSING = 4  # other scans with which a scan may close loops
@@ -39,7 +40,7 @@ _ENOUGH = 2  # answers of a search that are sure: then a scan needs no more
 def merge(
     clouds: Sequence[Any],
     *,
-    params: dict | None = None,
+    params: Params | None = None,
     sequence: bool = False,
     everywhere: bool = False,
     loop_closures: bool = False,
@@ -119,7 +120,7 @@ def register_share(
     rows: slice,
     *,
     kept: Kept,
-    params: dict | None = None,
+    params: Params | None = None,
     sequence: bool = False,
     guesses: Sequence[Float[np.ndarray, "4 4"] | None] | None = None,
     max_points: int | None = None,
