@@ -74,11 +74,16 @@ class Registrar:
     def _outcomes(self, tries: list[Try], kind: int) -> Any:
         if kind != ANYWHERE:
             return align_many((self._pair(each) for each in tries), ordered=False, **self._options)
-        single = {name: value for name, value in self._options.items() if name not in _OF_BATCHES}
-        return (
-            Outcome(row, align(*self._pair(each)[:2], initial="global", **single), None)
-            for row, each in enumerate(tries)
-        )
+        return (self._searched(row, each) for row, each in enumerate(tries))
+
+    def _searched(self, row: int, pair: Try) -> Outcome:
+        """The answer of a search of all rotations, which takes one pair at a time."""
+        options = {name: value for name, value in self._options.items() if name not in _OF_BATCHES}
+        try:
+            found = align(*self._pair(pair)[:2], initial="global", **options)
+        except ValueError as error:
+            return Outcome(row, None, str(error))
+        return Outcome(row, found, None)
 
     def _pair(self, pair: Try) -> tuple[Any, ...]:
         clouds = self._scans[pair.source].cloud, self._scans[pair.target].cloud

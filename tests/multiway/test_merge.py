@@ -186,6 +186,22 @@ def test_guesses_bring_in_scans_that_lie_too_far(views):
     assert motions.angle_between(found.pose(2), truth) < 1.0
 
 
+def test_a_scan_turned_over_is_found_by_a_search_of_all_rotations(views, kept, merged):
+    # given: the last scan is upside down
+    clouds, poses = views
+    over = np.diag([-1.0, 1.0, -1.0, 1.0])
+    turned = [*clouds[:4], motions.apply(over, clouds[4])]
+    # when
+    without = cfr_jax.merge(turned, kept=kept, fused=False)
+    found = cfr_jax.merge(turned, kept=kept, everywhere=True, fused=False)
+    # then
+    np.testing.assert_array_equal(without.placed, range(4))
+    assert without.left_out[0].index == 4 and without.left_out[0].reason
+    np.testing.assert_array_equal(found.placed, range(5))
+    truth = motions.inverse(poses[0]) @ poses[4] @ motions.inverse(over)
+    assert motions.angle_between(found.pose(4), truth) < 1.0
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [
