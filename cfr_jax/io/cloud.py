@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Real
 
+from cfr_jax.runtime.words import Refused
+
 # No unit of length makes a larger number a scan (the Earth is 6.4e9 mm from its center), and
 # float64 still resolves 1e-4 there. Flipped bits and missing-value marks (1e30) lie beyond.
 LARGEST_COORDINATE = 1e12
@@ -15,7 +17,7 @@ LARGEST_COORDINATE = 1e12
 UNIT_TOLERANCE = 0.02
 
 
-class CloudFileError(ValueError):
+class CloudFileError(Refused):
     """A file could not be read or written; says which file, where in it, and what was wanted."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import stat
 from pathlib import Path
 
@@ -162,3 +163,60 @@ def test_a_cache_that_cannot_be_kept_is_done_without(obstacle, jax_cache, tmp_pa
 
     # then
     assert jax_cache() is None
+
+
+def test_a_cache_is_made_for_its_owner_alone(jax_cache, tmp_path, monkeypatch):
+    monkeypatch.setenv("CFR_JAX_CACHE", str(tmp_path / "deep" / "place"))
+    before = os.umask(0)
+    try:
+        cache.keep_compiled_programs()
+    finally:
+        os.umask(before)
+    made = [tmp_path / "deep" / "place", *(tmp_path / "deep" / "place").iterdir()]
+    assert len(made) == 2
+    assert {stat.S_IMODE(folder.stat().st_mode) for folder in made} == {0o700}
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o720, 0o702, 0o1777])
+def test_a_cache_that_others_may_write_is_refused_in_words(
+    mode, jax_cache, tmp_path, monkeypatch, capsys
+):
+    # given
+    place = tmp_path / "place"
+    place.mkdir()
+    place.chmod(mode)
+    monkeypatch.setenv("CFR_JAX_CACHE", str(place))
+
+    # when
+    cache.keep_compiled_programs()
+
+    # then
+    assert jax_cache() is None and programs._places == []
+    assert "may be written by other users" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="may be written by other users"):
+        programs.keep_in(place)
+
+
+def test_a_cache_of_another_user_is_refused_in_words(jax_cache, tmp_path, monkeypatch, capsys):
+    # given
+    monkeypatch.setenv("CFR_JAX_CACHE", str(tmp_path))
+    tmp_path.chmod(0o755)
+    monkeypatch.setattr(os, "geteuid", lambda: tmp_path.stat().st_uid + 1)
+    if tmp_path.stat().st_uid == 0:  # folders of root are trusted
+        os.chown(tmp_path, 4321, -1)
+        monkeypatch.setattr(os, "geteuid", lambda: 0)
+
+    # when
+    cache.keep_compiled_programs()
+
+    # then
+    assert jax_cache() is None
+    assert "belongs to another user" in capsys.readouterr().err
+
+
+def test_a_folder_of_programs_that_others_may_write_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(programs, "_places", [])
+    programs.keep_in(tmp_path / "cache")
+    programs._places[0].chmod(0o777)
+    with pytest.raises(ValueError, match="programs-.* may be written by other users"):
+        programs.keep_in(tmp_path / "cache")
