@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
@@ -26,6 +27,8 @@ from cfr_jax.networks.parts import (
 )
 from cfr_jax.networks.record import Checkpoint, Network, Part, Place, places_of
 
+# Tracing takes a time that grows with them, and files may claim any number.
+MOST_ITERATIONS = 100
 _LAYERS = (
     *AUTHORS_LAYERS,
     ("feat_extractor_ball.prepool.0", "features/kernel_0", "features/bias_0"),
@@ -55,9 +58,14 @@ def _recognizes(tensors: Collection[str]) -> bool:
 
 
 def _arguments(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
-    annealing = shapes.get("annealing/out/bias", (10,))
+    annealing = math.prod(shapes.get("annealing/out/bias", (10,)))
     shared = shapes.get("cascade/kernel", ())[:1] == (1,)
-    return {"iterations": max(1, int(np.prod(annealing)) // 2), "shared": shared}
+    if annealing > 2 * MOST_ITERATIONS:
+        raise ValueError(
+            f"annealing/out/bias is for {annealing // 2:,} iterations, wanted at most "
+            f"{MOST_ITERATIONS}"
+        )
+    return {"iterations": max(1, annealing // 2), "shared": shared}
 
 
 def _theirs(tensors: Collection[str]) -> bool:
@@ -65,7 +73,10 @@ def _theirs(tensors: Collection[str]) -> bool:
 
 
 def _iterations_of_theirs(tensors: Collection[str]) -> dict[str, Any]:
-    return {"iterations": max(1, len({m[1] for m in map(_ITERATION.match, tensors) if m}))}
+    found = {m[1] for m in map(_ITERATION.match, tensors) if m}
+    if len(found) > MOST_ITERATIONS:
+        raise ValueError(f"it has {len(found):,} iterations, wanted at most {MOST_ITERATIONS}")
+    return {"iterations": max(1, len(found))}
 
 
 def _places(tensors: Collection[str]) -> dict[str, Place]:
