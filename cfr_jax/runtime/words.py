@@ -33,7 +33,12 @@ def shown(value: object, most: int = _MOST_OF_A_VALUE) -> str:
 def tidy(message: str) -> str:
     """A message of at most three lines and 600 characters, without control characters."""
     lines = message[: 8 * MOST].split("\n")[:_MOST_LINES]
-    return _shortened("\n".join("".join(map(_escaped, line)) for line in lines), MOST)
+    return _shortened(escaped("\n".join(lines)), MOST)
+
+
+def escaped(text: str) -> str:
+    """The text with all control characters but line feeds as `\\x1b` and the like."""
+    return "\n".join("".join(map(_escaped, line)) for line in text.split("\n"))
 
 
 def _escaped(character: str) -> str:
