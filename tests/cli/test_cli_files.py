@@ -81,7 +81,16 @@ def test_a_transform_is_read_from_every_form(name, tmp_path):
         ("short.txt", b"1 2 3"),
         ("words.txt", b"no numbers here"),
         ("binary.txt", b"\xff\xfe\x80"),
-        ("empty.txt", b""),
+        ("blank.txt", b" "),
+        ("seventeen.txt", b"1 " * 17),
+        ("underscores.txt", b"1_0 " * 16),
+        ("arabic.txt", "١ ".encode() * 16),
+        ("booleans.json", b"[[true, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
+        ("texts.json", b'[["1", 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]'),
+        (
+            "huge.json",
+            b"[" + b"[1" + b"0" * 400 + b", 0, 0, 0]," * 3 + b"[0, 0, 0, 1]]",
+        ),
         ("nan.txt", b"nan " * 16),
         ("three.json", b"[[1, 0, 0], [0, 1, 0], [0, 0, 1]]"),
         ("ragged.json", b"[[1, 0], [0]]"),
@@ -97,6 +106,13 @@ def test_a_file_without_a_transform_is_refused_by_name(name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=f"{name}: wanted a 4x4 transform"):
         read_transform(tmp_path / name)
+
+
+@pytest.mark.parametrize("kind", ["complex128", "bool", "U3", "V8", "M8[s]"])
+def test_an_array_of_something_else_than_numbers_is_refused(kind, tmp_path):
+    np.save(tmp_path / "t.npy", np.zeros((4, 4), kind))
+    with pytest.raises(ValueError, match="t.npy: .* wanted floats or integers"):
+        read_transform(tmp_path / "t.npy")
 
 
 def test_a_pickled_array_is_not_unpickled(tmp_path):
