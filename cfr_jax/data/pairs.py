@@ -18,11 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
 
-import h5py
 import numpy as np
 from jaxtyping import Float
 
+from cfr_jax.data.hdf5 import reading as hdf5
 from cfr_jax.geometry.motions import check_rigid
+from cfr_jax.runtime.words import Refused, shown
+
+_OF_A_PAIR = ("source", "target", "source_normals", "target_normals", "transform", "overlap")
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +155,9 @@ class Hdf5Pairs(PairFile):
 
     def __init__(self, path: str | Path):
         super().__init__(path)
-        try:
-            with h5py.File(self.path, "r") as file:
-                self.names = tuple(sorted(k for k, v in file.items() if isinstance(v, h5py.Group)))
-        except OSError as error:
-            raise ValueError(f"{self.path} is not an HDF5 file ({error})") from error
+        self.names = tuple(sorted(hdf5.read(self.path, groups=True).groups))
         if not self.names:
-            raise ValueError(f"{self.path} has no groups; wanted one per pair: source, target, ...")
+            raise Refused(f"{shown(path)} has no groups; wanted one per pair: source, target, ...")
 
     def frames(self, index: int) -> tuple[str | int, str | int]:
         """Frames that the source and the target of a pair were recorded from.
@@ -167,26 +166,28 @@ class Hdf5Pairs(PairFile):
         to the pair if it lacks them.
         """
         name = self.names[index]
-        with h5py.File(self.path, "r") as file:
-            said = file[name].attrs
-            if "source_frame" in said and "target_frame" in said:
-                return int(said["source_frame"]), int(said["target_frame"])
+        frames = [("", "source_frame"), ("", "target_frame")]
+        said = hdf5.read(self.path, group=name, attributes=frames).attributes
+        if len(said) == 2:
+            return int(said["@source_frame"]), int(said["@target_frame"])
         return f"{name}/source", f"{name}/target"
 
     def _read(self, index: int) -> Pair:
         name = self.names[index]
-        where = f"{self.path}, {name}"
-        with h5py.File(self.path, "r") as file:
-            held = {key: np.asarray(value) for key, value in file[name].items()}
+        where = f"{shown(self.path)}, {shown(name)}"
+        found = hdf5.read(self.path, group=name, arrays=_OF_A_PAIR)
+        held = found.arrays
         missing = [key for key in ("source", "target") if key not in held]
         if missing:
-            raise ValueError(f"{where} lacks {missing}, and holds only {sorted(held)}")
+            raise Refused(f"{where} lacks {missing}, and holds only {sorted(found.names)}")
         for key in ("source", "target", "source_normals", "target_normals"):
             if key in held:
                 held[key] = _checked_rows(
                     held[key], like=held[key.split("_")[0]], where=where, key=key
                 )
-        truth = held.get("transform")
+        truth, overlap = held.get("transform"), held.get("overlap")
+        if overlap is not None and (overlap.size != 1 or not np.isfinite(overlap).all()):
+            raise Refused(f"{where}: overlap has the shape {overlap.shape}, wanted one number")
         return Pair(
             name=name,
             source=held["source"],
@@ -194,7 +195,7 @@ class Hdf5Pairs(PairFile):
             source_normals=held.get("source_normals"),
             target_normals=held.get("target_normals"),
             transform=None if truth is None else check_rigid(f"{where}: transform", truth),
-            overlap=float(held["overlap"]) if "overlap" in held else None,
+            overlap=None if overlap is None else float(overlap.reshape(())),
         )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from flax.traverse_util import flatten_dict
 
 from cfr_jax.networks.annealing import AUTHORS_LAYERS
 from cfr_jax.networks.cfr.iterations import bind, heavy_features, iterations_of, unroll
@@ -25,6 +26,7 @@ from cfr_jax.networks.parts import (
     move,
     on_host,
 )
+from cfr_jax.networks.probability import uncalibrated
 from cfr_jax.networks.record import Checkpoint, Network, Part, Place, places_of
 
 # Tracing takes a time that grows with them, and files may claim any number.
@@ -85,6 +87,28 @@ def _places(tensors: Collection[str]) -> dict[str, Place]:
         rows = [(theirs.format(i), *ours) for theirs, *ours in _LAYERS_PER_ITERATION]
         found |= places_of(rows, stacked=True)
     return found
+
+
+_PARAMETERS = frozenset(place.path for place in _places(()).values())
+
+
+def check_params(params: Any) -> None:
+    """Raises ValueError unless all parameters of CFR are there, as arrays under their names."""
+    wanted = "wanted the parameters of load_params"
+    if not isinstance(params, Mapping):
+        raise ValueError(f"params: got a {type(params).__name__}, {wanted}")
+    try:
+        found = flatten_dict(uncalibrated(params), sep="/")
+    except (TypeError, AttributeError):  # names that are no text
+        found = {}
+    lacking = sorted(_PARAMETERS - found.keys())
+    if lacking:
+        some = "empty" if not params else f"without {lacking[0]}"
+        raise ValueError(f"params: got a dict that is {some}, {wanted}")
+    for name in sorted(_PARAMETERS):
+        if not hasattr(found[name], "shape"):
+            kind = type(found[name]).__name__
+            raise ValueError(f"params: got a {kind} as {name}, {wanted}")
 
 
 def parts(params: dict, settings: Settings) -> Callable[[Cloud, Cloud], Iterator[Part]]:

@@ -8,6 +8,7 @@ any pair there and back.
 from __future__ import annotations
 
 import functools
+from numbers import Integral
 from typing import Any
 
 import jax
@@ -19,6 +20,7 @@ from jaxtyping import Array, Float
 
 from cfr_jax.geometry import rigid
 from cfr_jax.networks.cfr.iterations import Encoded, encoded, iterate, iterations_of, moved_on
+from cfr_jax.networks.cfr.network import check_params
 from cfr_jax.networks.clues import NetworkClues, of_network, of_registration
 from cfr_jax.networks.inputs import Cloud, Settings, check_points, prepare
 from cfr_jax.networks.probability import calibration_of
@@ -58,6 +60,7 @@ def encode(
 ) -> Encoded:
     """The features of a reference in every iteration; hand it to `register` as the target, with the
     same settings. Raises ValueError as `register` does."""
+    check_params(params)
     clouds = {"target": target}
     finite = _checked(clouds)
     encoded = _encode(params, target, settings=settings)
@@ -91,6 +94,10 @@ def register(
     choice of neighbors. Raises ValueError on wrong shapes, and for values that are no finite
     numbers, where they can be seen: inside `jit` and `vmap` they cannot, and NaN in gives NaN out.
     """
+    check_params(params)
+    for name, count in (("iterations", iterations), ("cascades", cascades)):
+        if count is not None and (isinstance(count, bool) or not isinstance(count, Integral)):
+            raise ValueError(f"{name}: got {count!r}, wanted a whole number of at least 1")
     clouds = {"source": source, "target": target}
     finite = _checked(clouds)
     found = _register(
