@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Iterator
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from cfr_jax.cli.shared import numbers, outputs
 from cfr_jax.data import kinds
 
 if TYPE_CHECKING:
-    from cfr_jax.batch.jobs import Job
+    from cfr_jax.batch.jobs import Jobs
     from cfr_jax.batch.journal import Journal
     from cfr_jax.batch.sharding import Shard
 
@@ -131,10 +132,10 @@ def run(args: argparse.Namespace) -> int:
     shard = _shard(args.shard)
     print(f"recognized  {layout}")
     print(f"pairs       {len(jobs)}: {how}")
-    out = args.out
+    out, rows = args.out, range(len(jobs))
     if shard is not None:
-        jobs, out = jobs[shard.rows()], shard.beside(args.out)
-        print(f"shard       {shard.number} of {shard.count}: {len(jobs)} pairs")
+        rows, out = rows[shard.rows()], shard.beside(args.out)
+        print(f"shard       {shard.number} of {shard.count}: {len(rows)} pairs")
 
     from cfr_jax.batch.journal import Journal
     from cfr_jax.batch.sharding import other_shards
@@ -155,11 +156,11 @@ def run(args: argparse.Namespace) -> int:
     with Journal(kept, made_with, retry=args.retry_failed) as journal:
         for other in other_shards(kept) if shard is None else ():
             journal.adopt(other, made_with)
-        left = [job for job in jobs if job.key not in journal]
-        if len(left) < len(jobs):
-            print(f"done before {len(jobs) - len(left)}")
+        left = array("Q", (row for row in rows if jobs.key(row) not in journal))
+        if len(left) < len(rows):
+            print(f"done before {len(rows) - len(left)}")
         try:
-            _register(left, journal, weights.params, args)
+            _register(jobs, left, journal, weights.params, args)
         except KeyboardInterrupt:
             print(
                 f"cfr batch: stopped; {kept} keeps what is done\n"
@@ -167,10 +168,12 @@ def run(args: argparse.Namespace) -> int:
                 file=sys.stderr,
             )
             raise
-        return _tell((journal[job.key] for job in jobs), out, kept, args.strict)
+        return _tell((journal[jobs.key(row)] for row in rows), out, kept, args.strict)
 
 
-def _register(left: list[Job], journal: Journal, params: dict, args: argparse.Namespace) -> None:
+def _register(
+    jobs: Jobs, left: Sequence[int], journal: Journal, params: dict, args: argparse.Namespace
+) -> None:
     from cfr_jax.batch.records import as_record
     from cfr_jax.batch.stream import align_many
     from cfr_jax.runtime.progress import Progress
@@ -178,7 +181,7 @@ def _register(left: list[Job], journal: Journal, params: dict, args: argparse.Na
     if not left:
         return
     outcomes = align_many(
-        (job.pair for job in left),
+        (jobs[row].pair for row in left),
         params=params,
         refine=not args.no_refine,
         second_look=not args.no_second_look,
@@ -191,7 +194,7 @@ def _register(left: list[Job], journal: Journal, params: dict, args: argparse.Na
     failed = 0
     with Progress(total=len(left), desc="registering", unit=" pairs") as bar:
         for outcome in outcomes:
-            journal.write(as_record(left[outcome.index], outcome))
+            journal.write(as_record(jobs[left[outcome.index]], outcome))
             failed += outcome.error is not None
             if failed:
                 bar.set_postfix_str(f"{failed} failed", refresh=False)

@@ -11,7 +11,8 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, BinaryIO
+from io import BufferedReader
+from typing import Any
 
 from cfr_jax.runtime.words import Refused
 
@@ -26,7 +27,7 @@ _DIGITS = 20  # of the longest integer of 64 bits, with its sign
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str], most: int | None = None) -> Iterator[BinaryIO]:
+def opened(path: str | os.PathLike[str], most: int | None = None) -> Iterator[BufferedReader]:
     """A regular, nonempty file for reading; raises `Refused`, without the path, for anything else.
 
     `most` is the largest size in bytes that is read, by default half of this machine's memory.
