@@ -120,8 +120,9 @@ class Journal:
         whole = self._size_of_whole_lines()
         if whole or not start.startswith(begun):
             self.adopt(self.path, header["made_with"])  # before anything of it is changed
-        os.ftruncate(self._file, whole)
-        os.lseek(self._file, 0, os.SEEK_END)
+        if whole < os.fstat(self._file).st_size:
+            with _said(self.path):
+                os.ftruncate(self._file, whole)
         if not whole:
             self._append(header)
 
