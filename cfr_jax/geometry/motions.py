@@ -88,7 +88,8 @@ def are_rigid(transforms: Float[np.ndarray, "*batch 4 4"]) -> Bool[np.ndarray, "
     turns = sound[..., :3, :3]
     off = np.abs(turns @ turns.swapaxes(-1, -2) - np.eye(3)).max(axis=(-2, -1))
     last = np.abs(sound[..., 3, :] - (0, 0, 0, 1)).max(axis=-1)
-    proper = np.linalg.det(turns) > 0
+    with np.errstate(all="ignore"):  # of entries near the smallest float
+        proper = np.linalg.det(turns) > 0
     return np.asarray(finite & (off <= TOLERANCE) & proper & (last <= _LAST_ROW))
 
 

@@ -153,10 +153,8 @@ def _flat(params: Mapping[str, Any]) -> dict[str, Any]:
 
 def _check_shapes(tensors: dict[str, np.ndarray], record: Network) -> None:
     found = {name: leaf.shape for name, leaf in tensors.items()}
-    # refuses numbers of iterations that do not go together, before they are traced
-    fresh = functools.partial(record.fresh, **record.arguments(found))
-    wanted = jax.eval_shape(fresh, jax.random.key(0))
-    wanted = {name: leaf.shape for name, leaf in flatten_dict(wanted, sep="/").items()}
+    # `arguments` refuses more iterations than can be traced
+    wanted = _fresh_shapes(record, tuple(record.arguments(found).items()))
     for name in sorted(wanted.keys() | found.keys()):
         if wanted.get(name) != found.get(name):
             raise ValueError(
@@ -165,6 +163,14 @@ def _check_shapes(tensors: dict[str, np.ndarray], record: Network) -> None:
             )
         if tensors[name].dtype != np.float32:
             raise ValueError(f"{name} is {tensors[name].dtype}, wanted float32")
+
+
+@functools.lru_cache(maxsize=16)
+def _fresh_shapes(
+    record: Network, arguments: tuple[tuple[str, Any], ...]
+) -> Mapping[str, tuple[int, ...]]:
+    fresh = jax.eval_shape(functools.partial(record.fresh, **dict(arguments)), jax.random.key(0))
+    return {name: leaf.shape for name, leaf in flatten_dict(fresh, sep="/").items()}
 
 
 def _metadata(data: bytes) -> dict[str, str]:

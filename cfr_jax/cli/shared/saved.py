@@ -46,7 +46,7 @@ def read_result(path: Path) -> dict[str, Any]:
         for role in ("source", "target"):
             _check_cloud(role, document.get(role))
         for name, fits in _NEEDED.items():
-            if not fits(document.get(name)):
+            if name not in document or not fits(document[name]):
                 raise Refused(f'has no usable "{name}"')
         _check_motions(document)
     except Refused as error:
