@@ -28,7 +28,7 @@ test-slow: .venv/.dev
 	.ci/nightly
 
 coverage: .venv/.dev
-	$(BIN)/python -m pytest --cov --cov-report=term --cov-fail-under=92
+	$(BIN)/python -m pytest -n auto --dist loadfile --cov --cov-report=term --cov-fail-under=92
 
 lint: .venv/.dev
 	$(BIN)/ruff check .

@@ -1,8 +1,8 @@
 """Trains and compares the variants of an ablation: python ablate.py --ablation=weights
 
 The ablations are weights, passes, sinkhorn, annealing, features and normals (`eval_ablations.py`).
-What has to be trained is trained by `train.py` in runs/ablations, shortly, and shared by all
-ablations; the rest is `evaluate.py`. Run the same command again and it goes on where it stopped.
+Variants that need training are trained for a short time by `train.py`, in runs/ablations; all
+ablations share these runs. `evaluate.py` does the rest. To resume, run the same command again.
 """
 
 import runpy
@@ -14,18 +14,19 @@ from absl import app, flags
 
 _HERE = Path(__file__).resolve().parent
 _EVALUATION = _HERE / "configs" / "eval_ablations.py"
-_ABLATION = flags.DEFINE_string("ablation", None, "Which of them.")
-_OUT = flags.DEFINE_string("out", None, "As of evaluate.py; results/ablations/NAME if not given.")
-_STEPS = flags.DEFINE_integer("steps", None, "Of every training, instead of the config's.")
+_ABLATION = flags.DEFINE_string("ablation", None, "Which ablation to run.")
+_OUT = flags.DEFINE_string("out", None, "Folder for results (default: results/ablations/NAME).")
+_STEPS = flags.DEFINE_integer("steps", None, "Steps of every training, instead of the config's.")
 _LIMIT = flags.DEFINE_integer("limit", 300, "How many pairs to compare on; 0 for all.")
 
 
 def main(_) -> None:
-    """Runs `train.py` for each training that the ablation asks for, then `evaluate.py`."""
+    """Runs `train.py` for each training that the ablation needs, then `evaluate.py`."""
     known = runpy.run_path(str(_EVALUATION))
     name = _ABLATION.value
     if name not in known["ABLATIONS"]:
-        raise SystemExit(f"ablate.py: error: no ablation {name!r}: {', '.join(known['ABLATIONS'])}")
+        names = ", ".join(known["ABLATIONS"])
+        raise SystemExit(f"ablate.py: error: --ablation: got {name!r}, wanted one of {names}")
     steps = "" if _STEPS.value is None else str(_STEPS.value)
     chosen = f",{steps}" if steps else ""
     for variant in known["trainings"](name):

@@ -1,8 +1,8 @@
 """Compares methods: python evaluate.py --config=configs/eval_open_cad.py --out=results/open_cad
 
-Any field of the config can be set on the command line, as in --config.data.protocol=clean; all are
-in cfr_jax/evaluation/config.py. Run the same command again and it goes on where it stopped; methods
-added later join those already run.
+Any field of the config can be set on the command line, for example --config.data.protocol=clean;
+cfr_jax/evaluation/config.py explains all fields. To resume an interrupted run, or to add methods to
+an earlier one, run the command again.
 """
 
 import shlex
@@ -16,18 +16,18 @@ from cfr_jax.cli.shared import configured
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "The data, the methods, their settings.")
 _OUT = flags.DEFINE_string("out", None, "Folder for results.json, table.md, plots and gallery.")
-_METHODS = flags.DEFINE_list("methods", [], "Which of the config's methods; all if not given.")
+_METHODS = flags.DEFINE_list("methods", [], "Which of the config's methods to run (default: all).")
 _WEIGHTS = flags.DEFINE_string("weights", None, "Shipped weights by name, or a .safetensors file.")
 _LIMIT = flags.DEFINE_integer("limit", None, "How many pairs, from the first; 0 for all.")
-_SEED = flags.DEFINE_integer("seed", None, "Of the methods that draw, and of the intervals.")
+_SEED = flags.DEFINE_integer("seed", None, "Seed of random methods and of the intervals.")
 _PLOTS = flags.DEFINE_bool("plots", True, "Whether to draw plots and galleries.")
 
 
 def main(_) -> None:
-    """Everything of interest is in `cfr_jax.evaluation`."""
+    """Reads the flags; the work is done in `cfr_jax.evaluation`."""
     from cfr_jax.evaluation.comparison import compare
 
-    logging.set_verbosity(logging.ERROR)  # JAX tells of every backend that is not there
+    logging.set_verbosity(logging.ERROR)  # JAX logs every backend that is missing
     config = _CONFIG.value
     for name, flag in (("weights", _WEIGHTS), ("limit", _LIMIT), ("seed", _SEED)):
         if flag.value is not None:

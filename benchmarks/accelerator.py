@@ -1,11 +1,11 @@
 """Measures one machine in one call: python benchmarks/accelerator.py [--minutes 5]
 
-It measures the limits of arithmetic and memory, `register` at several sizes and batches, `align`, a
-training step with the drawing of its pairs, kernels per call and compile seconds, and checks that
-the results agree with the CPU's. It writes accelerator.json and a Markdown table, with the device
-and versions. With `--authors CHECKOUT` the authors' PyTorch programs run on the same clouds and
-device. Everything also runs on a CPU. The most important lines are measured first; lines that no
-longer fit into the time are listed.
+It measures the limits of arithmetic and memory, `register` at several sizes and batches, `align`
+and its parts, the last refinement on the host, a training step with the drawing of its pairs,
+kernels per call and compile seconds, and checks that the results agree with the CPU's. It writes
+accelerator.json and a Markdown table, with the device and versions. With `--authors CHECKOUT` the
+authors' PyTorch programs run on the same clouds and device. Everything also runs on a CPU. The most
+important lines are measured first; lines that no longer fit into the time are listed.
 """
 
 from __future__ import annotations
@@ -22,12 +22,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import peers
+import small_gicp
 import train_drawn
 from device_profile import profile
 from timing import Clock
 
 import cfr_jax as cfr
+from cfr_jax.alignment import refining, solving
+from cfr_jax.alignment.align import checked_params
+from cfr_jax.alignment.answers import answer
+from cfr_jax.alignment.case import Case
+from cfr_jax.alignment.planning import planned
 from cfr_jax.evaluation import machine
+from cfr_jax.geometry.trees import cores
+from cfr_jax.refine import find
+from cfr_jax.runtime import programs
 
 HERE = Path(__file__).parent
 SIZES = ((717, 1), (12000, 1), (717, 32), (2048, 1), (4000, 1), (717, 8))
@@ -81,6 +90,9 @@ def main() -> None:
     add("roofs", roofs)
     registers(sizes[:1])
     add("align", align, points=1024)
+    add("parts of align", align_parts, points=1024)
+    for points in (12_000, 100_000):
+        add("last refinement", lambda n=points: last_refinement(n), points=points)
     registers(sizes[1:3])
     trainings("bfloat16")
     add("same answers as the CPU", agreement, points=717)
@@ -183,6 +195,73 @@ def align() -> dict:
     first = cfr.align(source, target, second_look=False)
     found = timed(lambda: cfr.align(source, target, second_look=False).transform)
     return found | {"compile_s": round(first.seconds["compile"], 2)}
+
+
+def align_parts() -> dict:
+    """The same call taken apart, each part waited for: milliseconds on the host and on the device,
+    and what the program is without its refinement."""
+    source, target = clouds.pair(1024)
+    params = checked_params(None)
+
+    def plan(search):
+        return planned(source, target, whole=True, search=search)
+
+    made = plan(not solving.on_accelerator())
+    sides = solving.on_device(made.source, made.target)
+
+    def program(refine):
+        run = programs.compiled(solving.solve_pair, params, *sides, refine=refine)
+        return lambda: run(params, *sides)
+
+    whole, bare = program(find(True)), program(None)
+    found = jax.block_until_ready(whole())
+    fetched = jax.device_get(found)
+    case = Case(params, made, fetched)
+    parts = {
+        "prepare": lambda: plan(not solving.on_accelerator()) and None,
+        "prepare, neighbors on the host": lambda: plan(True) and None,
+        "upload": lambda: solving.on_device(made.source, made.target),
+        "look up the program": lambda: program(find(True)) and None,
+        "program": whole,
+        "program without refinement": bare,
+        "answer": lambda: answer(case) and None,
+    }
+    found = {name: timed(call)["ms"] for name, call in parts.items()}
+    times = []
+    for _ in range(RUNS):  # arrays keep what was fetched of them
+        result = jax.block_until_ready(whole())
+        began = time.perf_counter()
+        jax.device_get(result)
+        times.append(1e3 * (time.perf_counter() - began))
+    found["fetch"] = round(float(np.median(times)), 3)
+    parts = {f"{name}_ms": value for name, value in found.items()}
+    bare_kernels = {f"bare_{name}": value for name, value in profile(bare).items()}
+    return {"leaves": len(jax.tree.leaves(fetched))} | parts | profile(whole) | bare_kernels
+
+
+def last_refinement(points: int) -> dict:
+    """The refinement on all points and what is measured on them, on the host, beside small_gicp
+    from the same start: its own trees, covariances and descent, with as many threads."""
+    source, target = clouds.pair(points)
+    plan = planned(source, target, whole=True, search=not solving.on_accelerator())
+    case = solving.solve_case(Case(checked_params(None), plan), refine=find(True))
+    ours = timed(
+        lambda: refining.refine_every_point(case, refine=find("all_points")).found.transform, 5
+    )
+    sides, start = refining.every_point(plan), np.asarray(case.found.transform, np.float64)
+
+    def theirs():
+        small_gicp.align(
+            sides[1].points,
+            sides[0].points,
+            init_T_target_source=start,
+            downsampling_resolution=1e-6,  # no two points share a voxel
+            max_correspondence_distance=0.02,
+            num_threads=cores(),
+        )
+
+    alone = timed(theirs, 5)["ms"]
+    return ours | {"small_gicp_ms": alone, "times": round(ours["ms"] / alone, 2)}
 
 
 def agreement() -> dict:

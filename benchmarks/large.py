@@ -6,7 +6,7 @@ weights are read. Run it on a machine that does nothing else.
 
 `register` is the network on all points, with neighbors found on the host. From 2^25 affinities on,
 its match is streamed: iteration i computes the block i + 1 times, which is 20 times in all. `align`
-thins to its budget first. With `all points` it then refines on every point.
+thins to its budget first and refines on all points at the end; `align thinned` does not.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from cfr_jax.geometry.motions import angle_between
 
 FLOP_OF_AN_ENTRY = 20 * 2 * 96  # sweeps, multiply and add, channels
-WHAT = ("register", "align", "align all points")
+WHAT = ("register", "align thinned", "align")
 
 
 def main() -> None:
@@ -69,8 +69,8 @@ def measure(what: str, points: int) -> dict[str, float]:
     source, target, truth = pair(points)
     run: Callable[[np.ndarray, np.ndarray], dict] = {
         "register": registered,
-        "align": lambda x, y: aligned(x, y, all_points=False),
-        "align all points": lambda x, y: aligned(x, y, all_points=True),
+        "align thinned": lambda x, y: aligned(x, y, all_points=False),
+        "align": lambda x, y: aligned(x, y, all_points=True),
     }[what]
     found = run(source, target)
     error = float(angle_between(np.asarray(found.pop("transform"), np.float64), truth))

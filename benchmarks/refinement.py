@@ -57,7 +57,7 @@ def main() -> None:
         truth = pair.transform.astype(float)
         start = align(*clouds, refine=False).transform
         plan = planned(*clouds)
-        sides = solving.on_device(plan.source), solving.on_device(plan.target)
+        sides = solving.on_device(plan.source, plan.target)
         unit = [jnp.asarray(plan.frames.to_unit(m), jnp.float32) for m in (start, truth)]
         for name, motion in _ends(*sides, *unit).items():
             ends[name].append(plan.frames.to_caller(np.asarray(motion)))

@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from cfr_jax.networks.inputs import Cloud, Settings, prepare
     from cfr_jax.weights.files import load_params, save_params
 else:
+    from cfr_jax.runtime.lazy import loader
+
     _HOMES = {
         "Alignment": "alignment.answers",
         "align": "alignment.align",
@@ -61,14 +63,7 @@ else:
         "PointCloud": "io",
     }
 
-    def __getattr__(name):
-        if name not in _HOMES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        import importlib
-
-        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-        globals()[name] = value
-        return value
+    __getattr__ = loader(__name__, _HOMES)
 
     def __dir__():
         return __all__

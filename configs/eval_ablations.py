@@ -1,9 +1,9 @@
-"""The paper's ablations, one each: --config=configs/eval_ablations.py:weights
+"""One of the paper's ablations: --config=configs/eval_ablations.py:weights
 
-Of trainings of another length it is --config=configs/eval_ablations.py:weights,3000.
+For trainings with another number of steps: --config=configs/eval_ablations.py:weights,3000.
 
-As `eval_open_cad.py`, with the variants of one ablation as methods. Where a variant needs weights
-of its own, they are those that `ablate.py` trains by `ablations.py`.
+This is `eval_open_cad.py` with the variants of one ablation as methods. If a variant needs weights
+of its own, `ablate.py` trains them with `ablations.py`.
 """
 
 import runpy
@@ -11,20 +11,21 @@ from pathlib import Path
 
 from cfr_jax.evaluation.config import EvaluationConfig, MethodEntry
 
-# By ablation: its methods, what each does otherwise, and which training of `ablations.py` it needs.
+# For each ablation its methods; for each method the training of `ablations.py` that it needs ("":
+# none), and the settings that it changes.
 ABLATIONS = {
     # table 3 of the paper: a light layer of its own for each iteration, or one for all
     "weights": {"own_weights": ("cfr", {}), "shared_weights": ("shared", {})},
     # iteration i runs i Sinkhorn passes, or five in each
     "passes": {"passes_i": ("cfr", {}), "passes_5": ("constant_passes", {"passes": 5})},
-    # the same numbers, and what they cost
+    # the same results at different cost
     "sinkhorn": {"log_free": ("", {"match": "dense"}), "log_space": ("", {"match": "log space"})},
-    # annealing parameters of all iterations at once, or anew in each
+    # annealing parameters predicted for all iterations at once, or again in each
     "annealing": {
         "annealing_batched": ("cfr", {}),
         "annealing_each": ("annealing_each", {"repeat_annealing": True}),
     },
-    # features handed on from iteration to iteration, or extracted anew in each
+    # features passed on from iteration to iteration, or extracted again in each
     "features": {
         "cascade": ("cfr", {}),
         "extraction_each": ("extraction_each", {"repeat_extraction": True}),
@@ -34,8 +35,9 @@ ABLATIONS = {
 
 
 def get_config(chosen: str = "weights") -> EvaluationConfig:
-    """An ablation, and perhaps how many steps its trainings took."""
-    # a config is a file and no module: it is found beside this one
+    """The evaluation of an ablation; `chosen` is its name, optionally followed by the number of
+    steps of its trainings."""
+    # a config is a file, not a module, so it is loaded by its path
     beside = Path(__file__).with_name("eval_open_cad.py")
     config = runpy.run_path(str(beside))["get_config"]()
     ablation, _, steps = chosen.partition(",")
@@ -64,5 +66,5 @@ def trainings(ablation: str) -> tuple[str, ...]:
 
 
 def workdir(variant: str, steps: str = "") -> str:
-    """Where a variant is trained; by another number of steps, in another folder."""
+    """The folder where a variant is trained; another number of steps has another folder."""
     return f"runs/ablations_{steps}/{variant}" if steps else f"runs/ablations/{variant}"

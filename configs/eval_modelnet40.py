@@ -8,7 +8,7 @@ from cfr_jax.evaluation.config import EvaluationConfig
 
 def get_config() -> EvaluationConfig:
     """The methods of `eval_open_cad.py` on the benchmark's 1,266 test shapes."""
-    # a config is a file and no module: it is found beside this one
+    # a config is a file, not a module, so it is loaded by its path
     beside = Path(__file__).with_name("eval_open_cad.py")
     return EvaluationConfig(
         title="ModelNet40, partial pairs of unseen categories",

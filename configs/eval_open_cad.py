@@ -1,7 +1,7 @@
 """Evaluation on the open CAD corpus: partial, noisy pairs of the 21 unseen categories.
 
-Every method is given the exact normals; by --config=configs/eval_open_cad.py:estimated every method
-is given none, and estimates them from the noisy points. Those are two comparisons.
+Every method gets the exact normals. With --config=configs/eval_open_cad.py:estimated, methods get
+none and estimate them from the noisy points; this is a separate comparison.
 """
 
 from dataclasses import replace
@@ -16,7 +16,7 @@ def get_config(normals: str = "exact") -> EvaluationConfig:
         title="Open CAD shapes, partial pairs of unseen categories",
         data={
             "kind": "corpus",
-            # of `cfr data open-cad --out data/open_cad`, or any file in the ModelNet40 layout
+            # from `cfr data open-cad --out data/open_cad`, or any file in the ModelNet40 layout
             "path": "data/open_cad/test.h5",
             "protocol": "partial",  # or clean, noise, low_overlap, partial_both_ways
         },
@@ -26,7 +26,7 @@ def get_config(normals: str = "exact") -> EvaluationConfig:
 
 
 def exact() -> dict[str, MethodEntry]:
-    """All methods. Some take no normals of the pair: point-to-point ICP, GICP and KISS-Matcher."""
+    """All methods. Point-to-point ICP, GICP and KISS-Matcher do not use the normals of a pair."""
     kiss = {"voxel": 0.1, "thin": False, "normal_gain": 2.0, "feature_gain": 4.0}
     return {
         "identity": MethodEntry("identity"),
@@ -38,20 +38,23 @@ def exact() -> dict[str, MethodEntry]:
         "kiss_matcher": MethodEntry("kiss_matcher", kiss, threads=1),
         **by_features(0.3),
         "cfr": network("cfr", modules=True),
-        # a second cascade from where the first ended
+        # a second cascade that starts where the first one ended
         "cfr_twice": network("cfr", {"cascades": 2}),
-        # what a user gets: that, clouds laid about their own centroids, refined, looked at again
+        # what a user gets: also two cascades, clouds moved to their centroids, refinement, and a
+        # second look
         "cfr_align": network("cfr", {"refine": True, "through": "align"}),
-        # trained as long as RPM-Net was (configs/two_hours.py); left out where the file is not
+        # trained as long as RPM-Net (configs/two_hours.py); left out if there is no such file
         "cfr_two_hours": network("cfr", weights="cfr_two_hours"),
-        # as published; with the paper's speed-ups, which the others have, it answers the same
+        # as published; rpmnet_optim has the paper's speed-ups, and gives the same answers
         "rpmnet": network("rpmnet", {"settings": {"optimized": False}}, modules=True),
         "rpmnet_optim": network("rpmnet", modules=True),
+        **peers(),
     }
 
 
 def estimated() -> dict[str, MethodEntry]:
-    """Those that take normals, called NAME_estimated; RPM-Net once, since both answer the same."""
+    """The methods that use normals, as NAME_estimated; of both RPM-Nets, which answer the same,
+    only one."""
     known = exact() | by_features(0.45)
     networks = ("cfr", "cfr_twice", "cfr_align", "cfr_two_hours", "rpmnet_optim")
     chosen = ("icp_plane", "gicp_jax", *by_features(0.45), *networks)
@@ -61,13 +64,25 @@ def estimated() -> dict[str, MethodEntry]:
     }
 
 
-# For clouds of about 700 points in the unit sphere; lengths in its radius. One thread where threads
-# would race: for random numbers, or for the order of a sum.
+# For clouds of about 700 points in the unit sphere; lengths are in its radius. Methods have one
+# thread where several would race, for random numbers or for the order of a sum.
 _LOCAL = {"distances": (0.2, 0.1, 0.05), "start": "centroid"}
 
 
+def peers() -> dict[str, MethodEntry]:
+    """The other learned methods of the paper's table, which take no normals. Weights are those that
+    `dcp.py`, `fmr.py` and `rgm.py` train, or those of `cfr convert`; left out where there are none.
+    """
+    return {
+        "dcp": network("dcp", weights="dcp", modules=True),
+        "fmr": network("fmr", weights="fmr", modules=True),
+        # of reduced width (`rgm.py`), and four times through the network all the same
+        "rgm": network("rgm", weights="rgm", modules=True),
+    }
+
+
 def by_features(radius: float) -> dict[str, MethodEntry]:
-    """Methods on FPFH, of neighborhoods that are wider where normals are estimated."""
+    """Methods that match FPFH features over `radius`, which is wider for estimated normals."""
     features = {"distance": 0.05, "normal_radius": 0.2, "feature_radius": radius}
     return {
         "fgr": MethodEntry("fgr", features),
@@ -77,5 +92,5 @@ def by_features(radius: float) -> dict[str, MethodEntry]:
 
 
 def network(use: str, options: dict[str, Any] | None = None, **fields: Any) -> MethodEntry:
-    """A network on 8 pairs a call."""
+    """A network that solves 8 pairs per call, without refinement unless `options` say so."""
     return MethodEntry(use, {"refine": False} | (options or {}), batch=8, **fields)

@@ -1,21 +1,21 @@
-"""Evaluation on LiDAR scans in the layout of KITTI odometry, moved at random."""
+"""Evaluation on randomly moved LiDAR scans in the layout of KITTI odometry."""
 
 from cfr_jax.evaluation.config import EvaluationConfig, MethodEntry
 
 
 def get_config() -> EvaluationConfig:
-    """Lengths in meters."""
+    """All lengths are in meters."""
     return EvaluationConfig(
         title="LiDAR scans, frames about 10 m apart",
         data={
             "kind": "kitti",
             "path": "data/scans/lidar",  # or the folder of KITTI odometry
-            "sequences": ("00",),  # published numbers: 08, 09, 10
-            "distance": 10.0,  # between the frames of a pair
-            # frames from pair to pair; 0: the next pair starts after the last, as published, which
-            # leaves few pairs of a short sequence
+            "sequences": ("00",),  # published results use 08, 09, 10
+            "distance": 10.0,  # between the two frames of a pair
+            # frames from one pair to the next; 0: the next pair starts where the last one ended, as
+            # published, which leaves few pairs in a short sequence
             "stride": 2,
-            # first and stop: pairs of these frames alone; `scans.py` leaves (52, 69) for a test
+            # first frame and stop, to use only these; `scans.py` leaves (52, 69) for a test
             "frames": (),
             "points": 4000,
             "angle": 45.0,  # degrees, per Euler angle
@@ -32,13 +32,13 @@ def get_config() -> EvaluationConfig:
 
 
 def methods() -> dict[str, MethodEntry]:
-    """For scans thinned to 0.3 m, whose normals come from 3 m around, as published."""
+    """Methods for scans thinned to 0.3 m, with normals from a radius of 3 m, as published."""
     local = {"distances": (4.0, 2.0, 1.0), "start": "centroid"}
     features = {"normal_radius": 3.0, "feature_radius": 5.0, "voxel": 0.3, "distance": 0.6}
-    # prepared as `align` prepares clouds for our network
+    # clouds are prepared for RPM-Net in the way `align` prepares them for our network
     prepared = {"through": "preparation", "max_points": 4000, "refine": False}
     network = {"through": "align", "max_points": 4000, "refine": False}
-    # One thread where threads would race: for random numbers, or for the order of a sum.
+    # One thread where several would race, for random numbers or for the order of a sum.
     return {
         "identity": MethodEntry("identity"),
         "truth": MethodEntry("truth"),
@@ -56,4 +56,6 @@ def methods() -> dict[str, MethodEntry]:
         "rpmnet": MethodEntry("rpmnet", prepared | {"settings": {"optimized": False}}),
         "rpmnet_optim": MethodEntry("rpmnet", prepared),
         "rpmnet_optim_estimated": MethodEntry("rpmnet", prepared, estimated_normals=True),
+        # of clouds whose pairs of points are too many to be stored, DCP and RGM say so
+        **{name: MethodEntry(name, prepared, weights=name) for name in ("dcp", "fmr", "rgm")},
     }

@@ -4,13 +4,13 @@ from cfr_jax.evaluation.config import EvaluationConfig, MethodEntry
 
 
 def get_config() -> EvaluationConfig:
-    """Lengths in meters."""
+    """All lengths are in meters."""
     return EvaluationConfig(
         title="Depth images of a room",
         data={
             "kind": "auto",
             "path": "data/scans/rgbd/pairs.h5",  # or a list: source,target,16 numbers
-            # first and stop: pairs of these frames alone; `scans.py` leaves (400, 500) for a test
+            # first frame and stop, to use only these; `scans.py` leaves (400, 500) for a test
             "frames": (),
         },
         methods=methods(),
@@ -21,15 +21,16 @@ def get_config() -> EvaluationConfig:
 
 
 def methods() -> dict[str, MethodEntry]:
-    """For rooms thinned to 2.5 cm; such pairs have no normals, so every method estimates them."""
-    # frames of one video: where the camera was is a better start than the centroid
+    """Methods for rooms thinned to 2.5 cm; such pairs have no normals, so every method estimates
+    them."""
+    # for frames of one video, no motion is a better start than matching the centroids
     local = {"distances": (0.2, 0.1, 0.05), "start": "identity"}
     ours = {"cut": 0.05, "normal_radius": 0.1, "start": "identity"}
     features = {"normal_radius": 0.1, "feature_radius": 0.25, "voxel": 0.05, "distance": 0.05}
-    # prepared as `align` prepares clouds for our network
+    # clouds are prepared for RPM-Net in the way `align` prepares them for our network
     prepared = {"through": "preparation", "max_points": 2000, "refine": False}
     network = {"through": "align", "max_points": 2000}
-    # One thread where threads would race: for random numbers, or for the order of a sum.
+    # One thread where several would race, for random numbers or for the order of a sum.
     return {
         "identity": MethodEntry("identity"),
         "truth": MethodEntry("truth"),
@@ -45,4 +46,6 @@ def methods() -> dict[str, MethodEntry]:
         "cfr_align": MethodEntry("cfr", network | {"refine": True}),
         "rpmnet": MethodEntry("rpmnet", prepared | {"settings": {"optimized": False}}),
         "rpmnet_optim": MethodEntry("rpmnet", prepared),
+        # of clouds whose pairs of points are too many to be stored, DCP and RGM say so
+        **{name: MethodEntry(name, prepared, weights=name) for name in ("dcp", "fmr", "rgm")},
     }

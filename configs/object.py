@@ -1,7 +1,7 @@
-"""A long training on the open CAD corpus: the data and augmentation of `open_cad.py`.
+"""A long training on the open CAD corpus, with the data and augmentation of `open_cad.py`.
 
-Some ten hours on two cores. A restart costs nothing but the steps since the last checkpoint, so
-the run may be made in pieces.
+It takes about ten hours on two cores. A restart loses only the steps since the last checkpoint, so
+you can split the run into several.
 """
 
 from cfr_jax.training.config import Phase, TrainingConfig, TrainSection
@@ -9,11 +9,11 @@ from cfr_jax.training.config import Phase, TrainingConfig, TrainSection
 
 def get_config() -> TrainingConfig:
     """The weights `object`."""
-    # more, once the exact ones have become easy
+    # more of them, after exact normals have become easy
     estimated = {"estimated_normals": 0.6}
     return TrainingConfig(
-        # Neighborhoods cover the same patch of the shape in every phase, that of the test (why:
-        # docs/training.md, "Neighborhoods").
+        # In every phase, neighborhoods cover the same part of the shape as in the test. (For the
+        # reason see "Neighborhoods" in docs/notes/training.md.)
         phases=(
             Phase(steps=6000, points=256, neighbors=24, batch=8),
             Phase(steps=4750, points=358, neighbors=32, batch=8),

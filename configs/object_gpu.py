@@ -1,13 +1,13 @@
-"""`object` gone on with on one GPU, or several: pairs drawn there, bfloat16, a budget of minutes.
+"""Trains `object` further on one or more GPUs, which also draw the pairs; bfloat16; a time budget.
 
     python train.py --config=configs/object_gpu.py --workdir=runs/object_gpu \\
         --config.data.train=train.h5 --config.data.validation=val.h5 --config.train.minutes=10
 
-Compiling and validations are in the minutes. A number of steps instead of them:
+The minutes include compilation and validations. To give a number of steps instead:
 
     --config.train.minutes=0 '--config.phases[0].steps=8000'
 
-Eight GPUs share a batch of 64 as one does; with a larger one they are used better:
+Eight GPUs can share the batch of 64, but a larger batch uses them better:
 
     '--config.phases[0].batch=512'
 """
@@ -33,7 +33,7 @@ def get_config() -> TrainingConfig:
             schedule="trapezoid",
             peak_rate=1e-3,
             warmup=0.02,
-            cooldown=0.5,  # most of what the weights gain comes while the rate falls
+            cooldown=0.5,  # the weights improve most while the rate falls
             precision="bfloat16",
             draw="device",
             steps_at_once=25,  # about a second
@@ -42,6 +42,6 @@ def get_config() -> TrainingConfig:
         ),
         log_every=100,
         checkpoint_every=1000,
-        validate_every=1000,  # a second of half a minute
+        validate_every=1000,  # that is, for about one second of every half minute
         validation_pairs=310,
     )

@@ -1,4 +1,4 @@
-"""Training on scans of your own: a folder of single scans, and perhaps pairs with known motions.
+"""Training on your own scans: a folder of single scans, and optionally pairs with known motions.
 
 See docs/train-on-your-data.md.
 """
@@ -15,7 +15,7 @@ from cfr_jax.training.config import (
 
 
 def get_config() -> TrainingConfig:
-    """From shipped weights on. Say where scans are: --config.data.train.scans.path=FOLDER."""
+    """Starts from shipped weights. Set the folder by --config.data.train.scans.path=FOLDER."""
     return TrainingConfig(
         data=DataSection(train=sources(), validation=sources()),
         phases=(Phase(steps=2000, points=1024, neighbors=32, batch=8),),
@@ -28,7 +28,7 @@ def get_config() -> TrainingConfig:
             noise=(0.0, 0.01),
             outliers=(0.0, 0.03),
             uneven=0.2,
-            estimated_normals=0.7,  # of those that have normals; the rest always
+            estimated_normals=0.7,  # for pairs that have normals; without them, always
         ),
         train=TrainSection(peak_rate=3e-4, start_from="object"),
         validate_every=250,
@@ -37,9 +37,9 @@ def get_config() -> TrainingConfig:
 
 
 def sources() -> dict[str, dict[str, Any]]:
-    """What there may be. A source whose `repeat` is 0 is left out."""
+    """The possible sources. A source with `repeat` 0 is left out."""
     return {
-        # views of one scan, turned and cropped: needs no known motion
+        # both clouds are views of one scan, rotated and cropped: no known motion is needed
         "scans": {"kind": "clouds", "path": "", "repeat": 1},
         # a CSV list `source,target,16 numbers`, or HDF5
         "pairs": {"kind": "auto", "path": "", "repeat": 0},

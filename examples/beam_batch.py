@@ -1,12 +1,12 @@
-"""A list of pairs over many machines, by Apache Beam (`pip install "cfr_jax[beam]"`).
+"""Registers a list of pairs on many machines, with Apache Beam (`pip install "cfr_jax[beam]"`).
 
     python examples/beam_batch.py pairs.csv --out results --bundle 64
-    python examples/beam_batch.py gs://... --runner DataflowRunner ...   any runner's own options
+    python examples/beam_batch.py gs://... --runner DataflowRunner ...   any options of the runner
 
-The list is cut into bundles of pairs, the sources of one target together; each worker loads the
-weights once and answers a bundle with `cfr_jax.align_many`, so that it reads ahead, batches, and
-encodes a target once. Out come lines of JSON, as `cfr batch` writes them; a pair that cannot be
-read is a line with the reason. The runner retries bundles whose machine went away.
+The list is split into bundles of pairs, with the sources of one target next to each other. Each
+worker loads the weights once, and runs `cfr_jax.align_many` on a bundle: it reads ahead, works in
+batches, and encodes each target once. The output is lines of JSON, as from `cfr batch`; for a pair
+that cannot be read, the line gives the reason. The runner retries bundles if a machine is lost.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from cfr_jax.data.layout import recognize
 
 
 class Register(beam.DoFn):
-    """Bundles of pairs in, a JSON line a pair out."""
+    """Takes bundles of pairs, and returns one line of JSON per pair."""
 
     def __init__(self, weights: str, refine: bool):
         self._weights, self._refine = weights, refine
 
     def setup(self) -> None:
-        """Once a worker: JAX and the weights."""
+        """Loads JAX and the weights, once per worker."""
         from cfr_jax import load_params
 
         self._params = load_params(self._weights)
 
     def process(self, bundle: list[Job]) -> Iterator[str]:
-        """Answers one bundle."""
+        """Registers the pairs of one bundle."""
         from cfr_jax import align_many
         from cfr_jax.batch.journal import line_of
         from cfr_jax.batch.records import as_record
@@ -47,7 +47,7 @@ class Register(beam.DoFn):
 
 
 def bundles(jobs: list[Job], size: int) -> Iterator[list[Job]]:
-    """At most `size` pairs each, the sources of one target next to each other."""
+    """Yields bundles of at most `size` pairs, with the sources of one target next to each other."""
     by_target = [list(group) for _, group in groupby(sorted(jobs, key=_target), key=_target)]
     bundle: list[Job] = []
     for group in by_target:
@@ -65,11 +65,11 @@ def _target(job: Job) -> str:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Runs the pipeline; options it does not know are the runner's."""
+    """Runs the pipeline; passes unknown options on to the runner."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("pairs", type=Path, help="what `cfr batch` takes, but no HDF5 file")
-    parser.add_argument("--out", required=True, help="start of the names of the files written")
-    parser.add_argument("--bundle", type=int, default=64, help="pairs a worker takes at a time")
+    parser.add_argument("pairs", type=Path, help="what `cfr batch` takes, except an HDF5 file")
+    parser.add_argument("--out", required=True, help="how the names of the output files start")
+    parser.add_argument("--bundle", type=int, default=64, help="most pairs in a bundle")
     parser.add_argument("--weights", default="object")
     parser.add_argument("--no-refine", action="store_true")
     args, options = parser.parse_known_args(argv)

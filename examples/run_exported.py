@@ -1,9 +1,9 @@
-"""Runs a program that `cfr export` wrote; needs jax, numpy and flatbuffers, and not cfr_jax.
+"""Runs a program that `cfr export` wrote; needs jax, numpy and flatbuffers, but not cfr_jax.
 
     cfr export --points 1024 --platforms cpu,cuda,tpu --out model.stablehlo
     python run_exported.py model.stablehlo source.npy target.npy
 
-The clouds are (n, 3) arrays in one unit. Prints the 4x4 motion of the source onto the target.
+The clouds are (n, 3) arrays in the same unit. Prints the 4x4 motion of the source onto the target.
 The file is 32 bytes, the SHA-256 of the rest, and then the program as `jax.export` writes it.
 """
 
@@ -16,7 +16,10 @@ import numpy as np
 
 
 def register(exported, source, target, seed=0):
-    """(4, 4) float64; clouds of any size and unit, thinned at random to the program's capacity."""
+    """The motion of the source onto the target, (4, 4) float64.
+
+    The clouds may have any size and unit; they are thinned at random to the program's capacity.
+    """
     capacity = exported.in_avals[0].shape[0]
     centers = [cloud.mean(axis=0) for cloud in (source, target)]
     scale = max(
@@ -29,7 +32,7 @@ def register(exported, source, target, seed=0):
         unit = ((cloud[kept] - center) / scale).astype(np.float32)
         arguments += [np.pad(unit, ((0, capacity - len(unit)), (0, 0))), np.int32(len(unit))]
     found = np.asarray(exported.call(*arguments)["transform"], np.float64)
-    motion = np.eye(4)  # back in the caller's frame: x -> R (x - c_source) + scale t + c_target
+    motion = np.eye(4)  # in the frames of the files: x -> R (x - c_source) + scale t + c_target
     motion[:3, :3] = found[:3, :3]
     motion[:3, 3] = centers[1] + scale * found[:3, 3] - found[:3, :3] @ centers[0]
     return motion

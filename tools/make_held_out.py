@@ -36,14 +36,16 @@ PIECES = (
 CREDITS = """\
 # The held-out shapes
 
-`held_out.npz` holds {count} point clouds, sampled from models that their authors released under
-CC0 1.0 (public domain dedication, https://creativecommons.org/publicdomain/zero/1.0/) on
-blendswap.com. They were taken from Debian's package `sweethome3d-furniture` 1.8-1,
-`{library}`, and are released under CC0 1.0 as well.
+`held_out.npz` holds {count} point clouds, sampled from models that their authors released on
+blendswap.com under CC0 1.0 (public domain dedication,
+https://creativecommons.org/publicdomain/zero/1.0/). The models come from
+`{library}` in Debian's package
+`sweethome3d-furniture` 1.8-1. The point clouds are also released under CC0 1.0.
 
-Made by `tools/make_held_out.py`: {points} points a shape, drawn by area, with the normals of
-their faces, centered and scaled into the unit sphere; coordinates times 32767 as int16, normals
-times 127 as int8. All are of categories that the shipped weights were not trained on.
+`tools/make_held_out.py` made the file. Each shape has {points} points, sampled uniformly by area,
+with the normals of their faces, centered and scaled into the unit sphere. Coordinates are stored as
+int16 (times 32767), normals as int8 (times 127). The shipped weights were not trained on any of
+these categories.
 
 | shape | category | author |
 |---|---|---|

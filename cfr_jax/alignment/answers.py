@@ -15,7 +15,11 @@ from cfr_jax.networks.probability import calibration_of
 
 @dataclass(frozen=True)
 class Alignment:
-    """Answer of `align`; everything in the caller's frame and units."""
+    """Answer of `align`; everything in the caller's frame and units.
+
+    `fitness`, `inlier_rmse`, `overlap` and `information` are measured on all points if these were
+    refined, otherwise on the points that the network saw. `clues` always come from the latter.
+    """
 
     transform: Float[np.ndarray, "4 4"]
     """Maps source onto target: `transform @ [x; 1]` lies on the target. Float64."""
@@ -46,7 +50,7 @@ class Alignment:
     warnings: tuple[str, ...]
     """Why the answer should not be trusted, or what was done differently, in words."""
     seconds: dict[str, float]
-    """`compile` (zero when a program of this size was there already), `run`, and `total`."""
+    """`compile` (zero if a program of this size existed already), `run`, and `total`."""
     converged: bool = False
     """Whether the refinement ended because nothing moved any more; false without one."""
     steps: int = 0
@@ -54,13 +58,12 @@ class Alignment:
     overlap: float = 0.0
     """Estimated share of the source that the target saw, too."""
     information: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
-    """Information matrix of the inliers among the used points, as Open3D's
-    `get_information_matrix_from_point_clouds` gives it: rotation first, about the origin of the
-    target's frame."""
+    """Information matrix of the inliers, as Open3D's `get_information_matrix_from_point_clouds`
+    gives it: rotation first, about the origin of the target's frame."""
     initial: Float[np.ndarray, "4 4"] | None = None
-    """Where the network started, in the caller's frame: as given, or as a search found it."""
+    """Where the network started, in the caller's frame: as given, or as found by a search."""
     starts: int = 1
-    """How many starts were tried, or looked at a second time."""
+    """How many starts were tried, those of a second look included."""
     alternatives: Float[np.ndarray, "a 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """Other motions that a search found to fit about as well: the shape is nearly symmetric."""
 
@@ -105,7 +108,7 @@ def answer(case: Case) -> Alignment:
     fitness = float(found.quality.fitness)
     clues = confidence.named(found.clues)
     probability = doubts.probability(calibration_of(case.params), clues, fitness)
-    neighbors = min(plan.source.neighbors.shape[1], plan.target.neighbors.shape[1])
+    neighbors = min(plan.source.neighbor_count, plan.target.neighbor_count)
     return Alignment(
         transform=transform,
         transforms=frames.to_caller(np.asarray(found.registration.transforms)),

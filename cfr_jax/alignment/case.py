@@ -17,15 +17,15 @@ from cfr_jax.networks.cfr.registration import Registration
 
 @struct.dataclass
 class Found:
-    """What comes back from the device; batched after `vmap`."""
+    """What comes back from the device; batched after `vmap`. Arrays of numpy on the host."""
 
     registration: Registration
-    transform: Float[Array, "*batch 4 4"]
+    transform: Float[Array, "*batch 4 4"] | Float[np.ndarray, "*batch 4 4"]
     """Maps the source, as it was handed over, onto the target."""
-    improved: Bool[Array, "*batch"]
+    improved: Bool[Array, "*batch"] | Bool[np.ndarray, "*batch"]
     """Whether `transform` is not the network's last, but one that fits no worse."""
-    converged: Bool[Array, "*batch"]
-    steps: Int[Array, "*batch"]
+    converged: Bool[Array, "*batch"] | Bool[np.ndarray, "*batch"]
+    steps: Int[Array, "*batch"] | Int[np.ndarray, "*batch"]
     quality: quality.Quality
     clues: confidence.Clues
 

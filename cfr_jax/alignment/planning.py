@@ -40,6 +40,12 @@ class Plan:
     whole: tuple[PointCloud, PointCloud] | None = None
     """The caller's clouds with all their points, where they are asked for."""
 
+    @property
+    def thinned(self) -> bool:
+        """Whether one of the `whole` clouds has points that the network does not see."""
+        sides = zip(self.whole or (), (self.source, self.target), strict=False)
+        return any(len(cloud.points) > len(unit.rows) for cloud, unit in sides)
+
     def started_at(self, motion: Float[np.ndarray, "4 4"]) -> Plan:
         """The same clouds, the source moved by `motion` of unit clouds first."""
         points = motions.apply(motion, self.source.points).astype(np.float32)
@@ -75,13 +81,14 @@ def planned(
     max_points: int | None = None,
     seed: int = 0,
     whole: bool = False,
+    search: bool = True,
     settings: Settings = SETTINGS,
     to_unit: Callable[..., units.UnitCloud] = units.to_unit,
 ) -> Plan:
     """Reads, centers, scales and thins a pair; arguments and errors are those of `align`.
 
-    The plan keeps the `whole` clouds on demand. `to_unit` may stand in for `units.to_unit`, and
-    remember what it made.
+    The plan keeps the `whole` clouds on demand. Without `search` it leaves the search for
+    neighbors to the device. `to_unit` may stand in for `units.to_unit`, and remember what it made.
     """
     source, target = read_clouds(source, target)
     everywhere = isinstance(initial, str) and initial == "global"
@@ -107,6 +114,7 @@ def planned(
             neighbors=settings.neighbors,
             radius=settings.radius,
             seed=seed,
+            search=search,
         )
         for cloud, center, motion in (
             (source, frames.source_center, frames.initial),

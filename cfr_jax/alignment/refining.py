@@ -1,14 +1,14 @@
-"""Refinements that run on the host: what they get of a case, and what becomes of their fit."""
+"""Refinements on the host: what they get of a case, and what becomes of their answer."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
-from cfr_jax.alignment import solving
+from cfr_jax.alignment import measuring, solving
 from cfr_jax.alignment.case import Case
 from cfr_jax.alignment.planning import Plan
 from cfr_jax.geometry import motions
@@ -19,38 +19,38 @@ from cfr_jax.refine.surfaces import HostSurface
 
 
 def refine_used_points(case: Case, *, refine: Refinement) -> Case:
-    """The case refined on the points that the network saw, unless it fits worse then."""
+    """The case refined on the points that the network saw, unless the result fits worse."""
     began = time.perf_counter()
     plan, found = case.plan, case.solved()
     surfaces = _used(plan.source), _used(plan.target)
     fit = refine(*surfaces, np.asarray(found.transform, np.float64))
     case.seconds["run"] += time.perf_counter() - began
-    sides = solving.on_device(plan.source), solving.on_device(plan.target)
-    told = jnp.asarray(fit.transform, jnp.float32), jnp.asarray(fit.converged)
+    sides = solving.on_device(plan.source, plan.target)
+    told = np.asarray(fit.transform, np.float32), np.asarray(fit.converged)
     found = solving.timed(
-        case.seconds, solving.replaced, *sides, found, *told, jnp.array(fit.steps, jnp.int32)
+        case.seconds, solving.replaced, *sides, found, *told, np.asarray(fit.steps, np.int32)
     )
-    return dataclasses.replace(case, found=found)
+    return dataclasses.replace(case, found=jax.device_get(found))
 
 
 def refine_every_point(case: Case, *, refine: Refinement) -> Case:
-    """The case refined on all points of the caller's clouds; fitness and inlier error are then
-    measured on them, too."""
+    """The case refined on all points of the caller's clouds, and measured on all of them.
+
+    What the confidence and the free directions are told from stays as it was on the points that
+    the network saw: it depends on how dense a cloud is.
+    """
     began = time.perf_counter()
-    found = case.solved()
-    fit = refine(*_every(case.plan), np.asarray(found.transform, np.float64))
-    measured = {
-        name: jnp.asarray(value, jnp.float32)
-        for name, value in (("fitness", fit.fitness), ("inlier_rmse", fit.inlier_rmse))
-        if value is not None
-    }
+    found, surfaces = case.solved(), every_point(case.plan)
+    fit = refine(*surfaces, np.asarray(found.transform, np.float64))
+    transform = np.asarray(fit.transform, np.float64)
+    measured = measuring.measure(*surfaces, transform, solving.DISTANCE)
     found = dataclasses.replace(
         found,
-        transform=jnp.asarray(fit.transform, jnp.float32),
-        improved=found.improved | fit.improved,
-        converged=jnp.asarray(fit.converged),
-        steps=found.steps + fit.steps,
-        quality=dataclasses.replace(found.quality, **measured),
+        transform=transform,
+        improved=found.improved | np.asarray(fit.improved),
+        converged=np.asarray(fit.converged),
+        steps=found.steps + np.asarray(fit.steps, np.int32),
+        quality=dataclasses.replace(found.quality, **vars(measured)),
     )
     case.seconds["run"] += time.perf_counter() - began
     return dataclasses.replace(case, found=found)
@@ -61,7 +61,7 @@ def _used(unit: UnitCloud) -> HostSurface:
     return HostSurface(unit.points[unit.mask].astype(np.float64), normals)
 
 
-def _every(plan: Plan) -> tuple[HostSurface, HostSurface]:
+def every_point(plan: Plan) -> tuple[HostSurface, HostSurface]:
     """All points of both clouds, where the unit clouds of the plan lie."""
     assert plan.whole is not None, "planned with `whole`"
     frames = plan.frames

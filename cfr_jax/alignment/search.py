@@ -19,10 +19,11 @@ from jaxtyping import Array, Float
 
 from cfr_jax.alignment import planning, quality
 from cfr_jax.alignment.case import Case, Search
-from cfr_jax.alignment.solving import DeviceCloud, on_device, surface, timed
+from cfr_jax.alignment.solving import DeviceCloud, on_accelerator, on_device, surface, timed
 from cfr_jax.geometry import rigid, units
 from cfr_jax.networks.cfr.registration import encode, register
 from cfr_jax.networks.inputs import Settings, moved_by
+from cfr_jax.networks.record import Params
 from cfr_jax.refine import generalized_icp
 from cfr_jax.runtime import programs
 
@@ -51,7 +52,7 @@ programs.storable(Candidates)
 
 @functools.partial(jax.jit, static_argnames=("kept", "at_once"))
 def propose(
-    params: dict,
+    params: Params,
     source: DeviceCloud,
     target: DeviceCloud,
     starts: Float[Array, "s 4 4"],
@@ -101,20 +102,22 @@ def search(case: Case) -> Case:
 def tried(case: Case, starts: Float[np.ndarray, "s 4 4"], *, nearby: bool = False) -> Search:
     """The best motions of the case's source onto its target from all `starts` of unit clouds."""
     plan = case.plan
-    at_once = 1 if jax.default_backend() == "cpu" else _AT_ONCE
-    coarse = (
-        units.thinned(
-            unit,
-            budget=COARSE_POINTS,
-            neighbors=COARSE.neighbors,
-            radius=COARSE.radius,
-            seed=plan.seed,
+    at_once = _AT_ONCE if on_accelerator() else 1
+    coarse = on_device(
+        *(
+            units.thinned(
+                unit,
+                budget=COARSE_POINTS,
+                neighbors=COARSE.neighbors,
+                radius=COARSE.radius,
+                seed=plan.seed,
+            )
+            for unit in (plan.source, plan.target)
         )
-        for unit in (plan.source, plan.target)
     )
-    arguments = (case.params, *map(on_device, coarse), jnp.asarray(starts, jnp.float32))
+    arguments = (case.params, *coarse, jnp.asarray(starts, jnp.float32))
     proposed = timed(case.seconds, propose, *arguments, at_once=at_once)
-    whole = on_device(plan.source), on_device(plan.target)
+    whole = on_device(plan.source, plan.target)
     found = timed(case.seconds, polish, *whole, proposed.motions)
     real = np.asarray(found.fits) >= 0
     unit_motions = np.asarray(found.motions, np.float64)[real]

@@ -26,6 +26,7 @@ from cfr_jax.networks.cfr.registration import Registration, encode, register
 from cfr_jax.networks.clues import NetworkClues
 from cfr_jax.networks.inputs import Cloud, Settings, prepare
 from cfr_jax.networks.probability import Calibration
+from cfr_jax.networks.record import Params
 from cfr_jax.refine import Refinement, generalized_icp
 from cfr_jax.refine.generalized_icp import scores
 from cfr_jax.refine.surfaces import Surface
@@ -39,7 +40,8 @@ class DeviceCloud:
     """A unit cloud on the device, with neighbors, and with normals if the caller gave some."""
 
     points: Float[Array, "*batch n c"]
-    neighbors: Int[Array, "*batch n k"]
+    neighbors: Int[Array, "*batch n k"] | None
+    """None where the device is to find them."""
     mask: Bool[Array, "*batch n"]
 
     def prepared(self, settings: Settings = SETTINGS) -> Cloud:
@@ -60,7 +62,7 @@ programs.storable(
 programs.storable_static(Calibration, Calibration.write, Calibration.read)
 
 
-def solve(params: dict, source: Cloud, target: Encoded, *, refine: Refinement | None) -> Found:
+def solve(params: Params, source: Cloud, target: Encoded, *, refine: Refinement | None) -> Found:
     """The device's part for one pair of unit clouds: registered, refined, judged.
 
     Refining never answers worse, by its own score, than the network did or than the source lay
@@ -118,16 +120,25 @@ def surface(cloud: Cloud) -> Surface:
     return Surface(cloud.points, cloud.normals, mask)
 
 
-def on_device(unit: UnitCloud) -> DeviceCloud:
-    """A unit cloud, sent to the device."""
-    points = unit.points if unit.normals is None else np.hstack([unit.points, unit.normals])
+def on_accelerator() -> bool:
+    """Whether programs run on anything but a CPU."""
+    return jax.default_backend() != "cpu"
+
+
+def on_device(*clouds: UnitCloud) -> tuple[DeviceCloud, ...]:
+    """Unit clouds, all sent to the device at once."""
+    rows = [
+        unit.points if unit.normals is None else np.hstack([unit.points, unit.normals])
+        for unit in clouds
+    ]
     # not jnp.asarray, which compiles a copy of each shape
-    return DeviceCloud(*jax.device_put((points, unit.neighbors, unit.mask)))
+    sent = jax.device_put([(r, c.neighbors, c.mask) for r, c in zip(rows, clouds, strict=True)])
+    return tuple(DeviceCloud(*parts) for parts in sent)
 
 
 @functools.partial(jax.jit, static_argnames=("refine",))
 def solve_pair(
-    params: dict, source: DeviceCloud, target: DeviceCloud, *, refine: Refinement | None
+    params: Params, source: DeviceCloud, target: DeviceCloud, *, refine: Refinement | None
 ) -> Found:
     """`solve` for two clouds as `on_device` hands them over."""
     encoded = encode(params, target.prepared(), settings=SETTINGS)
@@ -135,15 +146,19 @@ def solve_pair(
 
 
 def solve_case(case: Case, *, refine: Refinement | None) -> Case:
-    """The case with what the network finds of its plan, refined by what JAX can trace."""
-    sides = on_device(case.plan.source), on_device(case.plan.target)
+    """The case with what the network finds for its plan, refined by what JAX can trace.
+
+    What is found comes back to the host in one transfer: on an accelerator each costs as much as
+    a few kernels.
+    """
+    sides = on_device(case.plan.source, case.plan.target)
     found = timed(case.seconds, solve_pair, case.params, *sides, refine=refine)
-    return dataclasses.replace(case, found=found)
+    return dataclasses.replace(case, found=jax.device_get(found))
 
 
 def timed(seconds: dict[str, float], function: Callable, *arguments: Any, **static: Any) -> Any:
-    """What a jitted function answers, when it is there; adds what that took to the `seconds` of
-    "compile" and of "run"."""
+    """What a jitted function answers, when it is there; adds the time to the `seconds` of "compile"
+    and of "run"."""
     began = time.perf_counter()
     program = programs.compiled(function, *arguments, **static)
     ready = time.perf_counter()

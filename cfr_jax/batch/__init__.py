@@ -1,4 +1,4 @@
-"""Many pairs: read ahead, registered in batches, resumed where they stopped.
+"""Many pairs: read ahead, registered in batches, and resumed after an interruption.
 
-What only names and counts pairs (`jobs`, `journal`, `sharding`) imports no JAX.
+The modules that only list and count pairs (`jobs`, `journal`, `sharding`) do not import JAX.
 """

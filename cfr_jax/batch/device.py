@@ -1,4 +1,4 @@
-"""Plans of one size, solved together: each target encoded once, the pairs by `vmap`."""
+"""Solves plans of one size together: encodes each target once and maps over the pairs."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import functools
 import hashlib
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from cfr_jax.alignment import solving
+from cfr_jax.alignment.align import on_host
 from cfr_jax.alignment.answers import Alignment, answer
 from cfr_jax.alignment.case import Case, Found
 from cfr_jax.alignment.planning import SETTINGS, Plan
@@ -21,27 +22,41 @@ from cfr_jax.batch.memo import Memo
 from cfr_jax.geometry.units import UnitCloud
 from cfr_jax.networks.cfr.iterations import Encoded
 from cfr_jax.networks.cfr.registration import encode
+from cfr_jax.networks.record import Params
 from cfr_jax.refine import Refinement
 from cfr_jax.runtime import programs
+
+Signature: TypeAlias = tuple[tuple[tuple[int, ...], int, bool], ...]
+"""Of source and target: the shapes of points and neighbors, and whether there are no normals."""
 
 _KEPT = 32  # encoded targets, about 2 MB each
 
 
 class Device:
-    """What runs on the accelerator, with the targets it has encoded lately."""
+    """Runs programs on the accelerator, and remembers the targets that it encoded last."""
 
-    def __init__(self, params: dict, refine: Refinement | None, second_look: bool, size: int):
-        self._params, self._refine, self.size = params, refine, size
-        self._second_look = refine is not None and second_look
+    def __init__(
+        self, params: Params, refinements: tuple[Refinement, ...], second_look: bool, size: int
+    ):
+        self._params, self._refinements = params, refinements
+        self.size: int = size
+        self._refine = refinements[0] if refinements else None
+        self._second_look = self._refine is not None and second_look
         self._encoded = Memo(_KEPT)
 
     def solve(self, plans: Sequence[Plan]) -> list[Alignment]:
-        """Answers of at most `size` plans of one `signature`; a short batch repeats its last plan,
-        so that it needs no program of its own."""
+        """The answers to at most `size` plans with the same `signature`.
+
+        A short batch repeats its last plan, so that it needs no program of its own.
+        """
         began = time.perf_counter()
         filled = [*plans, *[plans[-1]] * (self.size - len(plans))]
         targets, waited = zip(*(self._encode(plan.target) for plan in filled), strict=True)
-        arguments = (self._params, [solving.on_device(plan.source) for plan in filled], targets)
+        arguments = (
+            self._params,
+            list(solving.on_device(*(plan.source for plan in filled))),
+            targets,
+        )
         started = time.perf_counter()
         program = programs.compiled(solve_many, *arguments, refine=self._refine)
         compiled = time.perf_counter()
@@ -59,21 +74,26 @@ class Device:
         ]
 
     def _answer(self, plan: Plan, found: Found, seconds: dict[str, float]) -> Alignment:
-        """After a second look where there is doubt; those pairs are few, and looked at singly."""
+        """The answer, after a second look if it is in doubt, and the refinements on the host.
+
+        Both take one pair at a time.
+        """
         case = Case(self._params, plan, found, seconds=dict(seconds))
+        began = time.perf_counter()
         if self._second_look:
-            began = time.perf_counter()
             case = look_again(case, refine=self._refine)
-            case.seconds["total"] += time.perf_counter() - began
+        for step in on_host(case.plan, self._refinements):
+            case = step(case)
+        case.seconds["total"] += time.perf_counter() - began
         return answer(case)
 
     def _encode(self, target: UnitCloud) -> tuple[Encoded, float]:
-        """The features of a target, and how long their program took to compile."""
+        """The features of a target, and the seconds it took to compile their program."""
         compiling = 0.0
 
         def make() -> Encoded:
             nonlocal compiling
-            arguments = (self._params, solving.on_device(target))
+            arguments = (self._params, *solving.on_device(target))
             started = time.perf_counter()
             program = programs.compiled(encode_target, *arguments)
             compiling = time.perf_counter() - started
@@ -82,29 +102,29 @@ class Device:
         return self._encoded.get(_digest(target), make), compiling
 
 
-def signature(plan: Plan) -> tuple:
-    """Equal for plans that one compiled program can solve."""
+def signature(plan: Plan) -> Signature:
+    """A key that is equal for plans that one compiled program can solve."""
     return tuple(
-        (cloud.points.shape, cloud.neighbors.shape, cloud.normals is None)
+        (cloud.points.shape, cloud.neighbor_count, cloud.normals is None)
         for cloud in (plan.source, plan.target)
     )
 
 
 @jax.jit
-def encode_target(params: dict, target: solving.DeviceCloud) -> Encoded:
-    """The target's side of `solving.solve`, for a cloud as `solving.on_device` hands it over."""
+def encode_target(params: Params, target: solving.DeviceCloud) -> Encoded:
+    """The target's side of `solving.solve`, for a cloud that `solving.on_device` returned."""
     return encode(params, target.prepared(), settings=SETTINGS)
 
 
 @functools.partial(jax.jit, static_argnames=("refine",))
 def solve_many(
-    params: dict,
+    params: Params,
     sources: Sequence[solving.DeviceCloud],
     targets: Sequence[Encoded],
     *,
     refine: Refinement | None,
 ) -> Found:
-    """`solving.solve` of pairs of one size, all at once; every leaf has the pairs in front."""
+    """`solving.solve` for pairs of one size, all at once; each leaf has the pairs as first axis."""
 
     def solve(source: solving.DeviceCloud, target: Encoded) -> Found:
         return solving.solve(params, source.prepared(), target, refine=refine)
@@ -112,7 +132,7 @@ def solve_many(
     def stacked(clouds: Any) -> Any:
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
 
-    if len(sources) == 1:  # without an axis of length one, which slows a CPU down
+    if len(sources) == 1:  # without a batch axis: one of length one makes a CPU slower
         return stacked([solve(sources[0], targets[0])])
     return jax.vmap(solve)(stacked(sources), stacked(targets))
 

@@ -1,4 +1,4 @@
-"""Which pairs are in a file or folder: names and how to read them, but no cloud read yet."""
+"""Lists the pairs in a file or folder: their names and how to read them. Reads no cloud yet."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _TARGETS = ("target", "tgt", "dst")
 
 @dataclass(frozen=True)
 class Job:
-    """A pair by its names, which tell it from all others of its list."""
+    """A pair of a list; the names and `repeat` identify it."""
 
     source: str
     target: str
     repeat: int
-    """How many pairs of these names come before it in the list."""
+    """How many pairs with the same names come before it in the list."""
     pair: tuple[Path, Path] | Callable[[], tuple[Any, Any]]
-    """As `align_many` takes it."""
+    """The pair in a form that `align_many` takes."""
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """What the journal knows it by."""
+        """The key of this pair in the journal."""
         return self.source, self.target, self.repeat
 
 
@@ -63,22 +63,24 @@ class Jobs(Sequence[Job]):
 
 
 def jobs_of(layout: Layout, target: Path | None = None) -> tuple[Jobs, str]:
-    """The pairs of what was recognized, in order, and in words what was paired with what.
+    """The pairs of recognized data, in order, and a phrase that says what was paired with what.
 
-    With `target` every cloud of a folder is laid on that one file. Raises ValueError where there
-    is no pair, and for data that are no pairs, with what they are for.
+    With `target`, every cloud of a folder is registered onto that one file. Raises ValueError if
+    there is no pair, and for data without pairs; the message then says what such data are for.
     """
     kind = layout.kind
     if target is not None and kind.list_scans is None:
-        raise ValueError(f"target: {layout.path} is {layout.found}, which says its own targets")
+        raise ValueError(
+            f"target: {layout.path} is {layout.found}, which already names its targets"
+        )
     if kind.list_pairs is not None:
         listing = kind.list_pairs(layout.path)
         return Jobs(listing.names, listing.pairs), listing.how
     if kind.list_scans is not None:
         return _of_files(layout, kind.list_scans(layout.path), target)
     raise ValueError(
-        f"{layout.path} is {layout.found}, and no pairs\n"
-        "`evaluate.py` makes pairs of shapes, and `cfr data info` shows them"
+        f"{layout.path} is {layout.found}, not pairs\n"
+        "`evaluate.py` makes pairs from shapes, and `cfr data info` shows the shapes"
     )
 
 
@@ -100,7 +102,7 @@ def _of_files(layout: Layout, files: list[Path], target: Path | None) -> tuple[J
         how = "each onto the one before it, by name"
     if not places:
         raise ValueError(
-            f"{folder}: {layout.found}, and no two to lay on each other\n"
+            f"{folder}: {layout.found}, but no two that could be registered onto each other\n"
             "give --target FILE, or a CSV list of `source,target` lines"
         )
     names = [tuple(_inside(folder, file) for file in place) for place in places]
@@ -108,7 +110,10 @@ def _of_files(layout: Layout, files: list[Path], target: Path | None) -> tuple[J
 
 
 def _by_name(folder: Path, files: list[Path]) -> list[tuple[Path, Path]]:
-    """Files whose names differ in `source` and `target` alone (or src, tgt, dst), if all do."""
+    """Pairs of files whose names differ only in `source` and `target` (or src, tgt, dst).
+
+    Empty unless all files form such pairs.
+    """
     sides: tuple[dict[str, Path], dict[str, Path]] = {}, {}
     for file in files:
         inside = file.relative_to(folder).with_suffix("").as_posix()

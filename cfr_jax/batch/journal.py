@@ -94,17 +94,20 @@ class Journal:
         if header.get("format") != FORMAT or not isinstance(header.get("made_with"), dict):
             older = str(header.get("format")).startswith("cfr_jax/batch/")
             what = (
-                "a journal of another version" if older else "no journal of `cfr batch`, or damaged"
+                "a journal of another version"
+                if older
+                else "not a journal of `cfr batch`, or damaged"
             )
-            raise Refused(f"{shown(path)} is there and is {what}\nmove it, or choose another --out")
+            raise Refused(f"{shown(path)} exists, but is {what}\nmove it, or choose another --out")
         theirs = header["made_with"]
         differing = [name for name in made_with if theirs.get(name) != made_with[name]]
         if differing:
             name = differing[0]
             raise Refused(
-                f"{shown(path)} was begun with {name} {shown(repr(theirs.get(name)), 80)}, "
+                f"{shown(path)} was started with {name} {shown(repr(theirs.get(name)), 80)}, "
                 f"not {made_with[name]!r}\n"
-                "give the same options to go on, remove it to start anew, or choose another --out"
+                "give the same options to continue, remove it to start over, or choose another "
+                "--out"
             )
         with _said(path):
             for start, record in records:
@@ -229,7 +232,7 @@ def _record(line: bytes, where: str, header: bool = False) -> dict[str, Any]:
             raise Refused("its checksum does not fit")
         record = parse_json(line)
         if not header and not _is_record(record):
-            raise Refused("it is no record of a pair")
+            raise Refused("it is not a record of a pair")
     except Refused as error:
         raise Refused(
             f"{where} is damaged ({error}): remove the line, and its pair is registered again"

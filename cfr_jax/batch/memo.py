@@ -1,4 +1,4 @@
-"""Values that many threads ask for and one of them makes."""
+"""Values that many threads may ask for, and only one of them computes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Memo:
-    """The last `most` values by key. Whoever asks for one that is being made waits for it."""
+    """The last `most` values, by key. A thread that asks for a value in progress waits for it."""
 
     def __init__(self, most: int):
         self._most = most
@@ -18,8 +18,10 @@ class Memo:
         self._lock = threading.Lock()
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """The value of `key`, made by `make` if it is not there; what `make` raises is raised to
-        all who wait, and forgotten."""
+        """The value of `key`, computed by `make` if it is not there.
+
+        If `make` raises, all waiting threads get the error, and nothing is kept.
+        """
         with self._lock:
             mine = key not in self._held
             future = self._held.setdefault(key, Future())

@@ -1,4 +1,4 @@
-"""What is written of a pair: a JSON record (`cli/schemas`), and the row of a table."""
+"""What is written about a pair: a JSON record (`cli/schemas`) and a row of the table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COLUMNS = ("source", "target", "status", *_FIGURES, *_CELLS, "remarks")
 
 
 def as_record(job: Job, outcome: Outcome) -> dict[str, Any]:
-    """Everything that is known of a pair; null for all figures of one that failed."""
+    """Everything that is known about a pair; if it failed, all figures are null."""
     found = outcome.alignment
     figures = dict.fromkeys(
         (*_FIGURES, "transform", "transforms", "refined", "neighbors", "used", "seconds")

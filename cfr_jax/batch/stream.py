@@ -1,4 +1,4 @@
-"""`align_many`: any number of pairs, answered as `align` answers each."""
+"""`align_many`: `align` for any number of pairs."""
 
 from __future__ import annotations
 
@@ -9,27 +9,26 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-
-from cfr_jax.alignment.align import checked_params
+from cfr_jax.alignment.align import checked_params, chosen_refinements
 from cfr_jax.alignment.answers import Alignment
 from cfr_jax.alignment.planning import DEFAULT_BUDGET, Plan, planned, whole_number
-from cfr_jax.batch.device import Device, signature
+from cfr_jax.alignment.solving import on_accelerator
+from cfr_jax.batch.device import Device, Signature, signature
 from cfr_jax.batch.memo import Memo
 from cfr_jax.geometry import units
 from cfr_jax.io import PointCloud, as_point_cloud
-from cfr_jax.refine import find
+from cfr_jax.networks.record import Params
 
-# More pairs a call keep an accelerator busy, and a CPU's caches cold.
+# More pairs per call keep an accelerator busy, but do not fit in a CPU's caches.
 ON_CPU, ON_ACCELERATOR = 1, 16
-_TARGET_CLOUDS = 4  # whole clouds of files, which may be large
+_TARGET_CLOUDS = 4  # whole clouds from files, which may be large
 _TARGET_UNITS = 64
-_MOST_WAITING = 8  # batches' worth of pairs, before one is solved that is not full
+_MOST_WAITING = 8  # this many batches of pairs may wait before a batch is solved that is not full
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one pair."""
+    """The result for one pair: an alignment or an error."""
 
     index: int
     """Position of the pair in the input, from 0."""
@@ -41,9 +40,10 @@ class Outcome:
 def align_many(
     pairs: Iterable[Any],
     *,
-    params: dict | None = None,
+    params: Params | None = None,
     refine: bool | str = True,
     max_points: int | None = None,
+    all_points: bool = True,
     second_look: bool = True,
     seed: int = 0,
     batch: int | None = None,
@@ -62,8 +62,9 @@ def align_many(
     file or with the same points, is read and encoded once while it is among the last ones used.
 
     With `ordered`, outcomes come in the order of the pairs. Otherwise they come as soon as they are
-    done. The answers equal those of `align` up to float32 rounding. A `second_look` runs pair by
-    pair. `refine` may name any refinement that JAX can trace. If a pair cannot be read or has no
+    done. The answers equal those of `align` up to float32 rounding. A `second_look` and the last
+    refinement, on `all_points`, run pair by pair. `refine` may name any refinement that JAX can
+    trace. If a pair cannot be read or has no
     answer, its outcome has an `error`, and the others continue. Do not change an array before its
     outcome has come.
 
@@ -74,27 +75,27 @@ def align_many(
         budget = whole_number("max_points", max_points, least=3)
     seed = whole_number("seed", seed, least=0)
     if batch is None:
-        batch = ON_CPU if jax.default_backend() == "cpu" else ON_ACCELERATOR
+        batch = ON_ACCELERATOR if on_accelerator() else ON_CPU
     if workers is None:
         workers = min(4, os.cpu_count() or 1)
     weights = checked_params(params)
-    refinement = find(refine)
-    if refinement is not None and not refinement.traceable:
+    refinements = chosen_refinements(refine, all_points=all_points)
+    if refinements and not refinements[0].traceable:
         raise ValueError(
             f"refine: got {refine!r}, which runs on the host; wanted True, False or one that JAX "
             "can trace. `align` takes any, pair by pair"
         )
-    device = Device(weights, refinement, second_look, whole_number("batch", batch, least=1))
+    device = Device(weights, refinements, second_look, whole_number("batch", batch, least=1))
     workers = whole_number("workers", workers, least=1)
-    done = _done(_Planner(budget, seed), pairs, device, workers)
+    done = _done(_Planner(budget, seed, len(refinements) > 1), pairs, device, workers)
     return _in_order(done) if ordered else done
 
 
 class _Planner:
-    """Pairs made ready, by many threads at once; targets that come again are not made again."""
+    """Prepares pairs, on many threads at once; repeated targets are prepared only once."""
 
-    def __init__(self, budget: int, seed: int):
-        self._budget, self._seed = budget, seed
+    def __init__(self, budget: int, seed: int, whole: bool):
+        self._budget, self._seed, self._whole = budget, seed, whole
         self._clouds, self._units = Memo(_TARGET_CLOUDS), Memo(_TARGET_UNITS)
 
     def __call__(self, pair: Any) -> Plan:
@@ -110,7 +111,7 @@ class _Planner:
             if cloud is not target:
                 return make()[1]
             center, scale, motion = place
-            # the cloud is kept beside, so that no other gets its id
+            # the value keeps the cloud alive, so that no other cloud can get its id
             key = id(cloud), center.tobytes(), scale, motion.tobytes()
             return self._units.get(key, make)[1]
 
@@ -121,19 +122,21 @@ class _Planner:
             to_unit=to_unit,
             max_points=self._budget,
             seed=self._seed,
+            whole=self._whole,
+            search=not on_accelerator(),
         )
         if plan.starts is not None:
             raise ValueError(
-                "initial: got several starts, wanted one (4, 4); a search is for `align` alone"
+                "initial: got several starts, wanted one (4, 4); only `align` can search"
             )
         return plan
 
 
 def _done(plan: _Planner, pairs: Iterable[Any], device: Device, workers: int) -> Iterator[Outcome]:
-    """Outcomes as they come; the bucket that holds the oldest pair goes first where many wait."""
-    waiting: dict[tuple, list[tuple[int, Plan]]] = {}
+    """Yields outcomes as they come; if many pairs wait, solves the batch with the oldest first."""
+    waiting: dict[Signature, list[tuple[int, Plan]]] = {}
 
-    def solve(key: tuple) -> Iterator[Outcome]:
+    def solve(key: Signature) -> Iterator[Outcome]:
         rows, plans = zip(*waiting.pop(key), strict=True)
         for row, alignment in zip(rows, device.solve(plans), strict=True):
             yield Outcome(row, alignment, None)
@@ -141,7 +144,7 @@ def _done(plan: _Planner, pairs: Iterable[Any], device: Device, workers: int) ->
     for index, future in _ahead(plan, pairs, workers, 2 * device.size + workers):
         try:
             ready = future.result()
-        except Exception as error:  # whatever a file may hold, it is this pair's failure
+        except Exception as error:  # whatever is in a file, only this pair fails
             yield Outcome(index, None, _reason(error))
             continue
         key = signature(ready)
@@ -157,7 +160,7 @@ def _done(plan: _Planner, pairs: Iterable[Any], device: Device, workers: int) ->
 def _ahead(
     plan: Callable[[Any], Plan], pairs: Iterable[Any], workers: int, most: int
 ) -> Iterator[tuple[int, Future]]:
-    """Each pair's plan in the order of the pairs, up to `most` begun before they are asked for."""
+    """Yields the plan of each pair, in order; starts up to `most` of them ahead of time."""
     pool = ThreadPoolExecutor(workers, thread_name_prefix="cfr-read")
     begun: deque[tuple[int, Future]] = deque()
     try:
@@ -167,7 +170,7 @@ def _ahead(
                 yield begun.popleft()
         while begun:
             yield begun.popleft()
-    finally:  # also where nobody asks for more
+    finally:  # also if the caller stops early
         pool.shutdown(cancel_futures=True)
 
 

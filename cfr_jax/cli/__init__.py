@@ -55,7 +55,7 @@ exit codes:
   2    an input, an option or an output that cannot be used (at most three lines on stderr)
   3    registered, but not to be trusted (only with --strict)
   130  interrupted
-  141  the reader of the output has closed it
+  141  the reader of the output closed it
 
 environment:
   CFR_JAX_CACHE      where compiled programs are kept, so that the next call starts faster:
@@ -69,12 +69,12 @@ UNUSABLE = 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; returns its exit code, as `cfr --help` lists them."""
-    # XLA remarks on slow compilations there; standard error is for what the user can act on.
+    """Runs one command; returns its exit code (`cfr --help` lists them)."""
+    # XLA would comment on slow compilations; standard error is for what the user can act on.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
         if sys.stdout is not None and hasattr(sys.stdout, "reconfigure"):
-            # A file's name may hold bytes that no encoding can print.
+            # The name of a file may hold bytes that no encoding can print.
             sys.stdout.reconfigure(errors="backslashreplace")
         return _run(argv)
     except BrokenPipeError:
@@ -94,7 +94,7 @@ def _run(argv: Sequence[str] | None) -> int:
         except SystemExit as stop:  # after help, or after `_Parser.error`
             code = int(stop.code or 0)
         if sys.stdout is not None:
-            sys.stdout.flush()  # while a full disk can still be told
+            sys.stdout.flush()  # while a full disk can still be reported
         return code
     except BrokenPipeError:
         raise
@@ -107,8 +107,10 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _drop_output() -> None:
-    """What is still buffered for a standard output that takes no more, goes nowhere: the
-    interpreter flushes once again on its way out, and would complain."""
+    """Drops what is still buffered, if standard output takes no more.
+
+    Otherwise the interpreter would flush again on exit, and complain.
+    """
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -117,7 +119,7 @@ def _drop_output() -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Complains in few lines: the usage of a command would bury what was wrong."""
+    """Reports errors in a few lines: the usage of a command would bury what was wrong."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(UNUSABLE, _complaint(self.prog, message, f"try {self.prog} --help") + "\n")

@@ -1,4 +1,4 @@
-"""`cfr batch PAIRS --out results.csv`: many pairs, and no answer lost on the way."""
+"""`cfr batch PAIRS --out results.csv`: registers many pairs, and loses no answer on the way."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cfr_jax.cli.shared import numbers, outputs
+from cfr_jax.cli.shared import clouds, numbers, outputs
+from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.data import kinds
 
 if TYPE_CHECKING:
     from cfr_jax.batch.jobs import Jobs
     from cfr_jax.batch.journal import Journal
     from cfr_jax.batch.sharding import Shard
+    from cfr_jax.networks.record import Params
 
 UNTRUSTED = 3
 
@@ -47,7 +49,7 @@ examples:
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr batch`."""
     parser = commands.add_parser(
         "batch",
@@ -84,6 +86,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help=f"exit with {UNTRUSTED} if a pair failed or is not to be trusted",
     )
     how = parser.add_argument_group("how to register")
+    clouds.add_columns(how)
     how.add_argument("--no-refine", action="store_true", help="take the network's own answers")
     how.add_argument(
         "--no-second-look", action="store_true", help="keep the first answers, even if in doubt"
@@ -91,6 +94,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     how.add_argument("--weights", metavar="W", help="a shipped name, or a .safetensors file")
     how.add_argument(
         "--max-points", metavar="N", type=numbers.positive, help="most points of each cloud"
+    )
+    how.add_argument(
+        "--thinned",
+        action="store_true",
+        help="do not refine large clouds on all of their points at the end",
     )
     how.add_argument(
         "--seed",
@@ -111,7 +119,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def _kinds() -> str:
-    """The kinds of data that have pairs, or clouds to pair, a line each."""
+    """The kinds of data that have pairs, or clouds to pair, one line each."""
     return "\n".join(
         f"  {kind.name:11s} {kind.words}"
         for kind in kinds.known()
@@ -119,10 +127,12 @@ def _kinds() -> str:
     )
 
 
+@clouds.telling("cfr batch")
 def run(args: argparse.Namespace) -> int:
-    """Refuses what can be refused, does what is not done yet, writes the table."""
+    """Checks the arguments, registers the pairs that are not done yet, and writes the table."""
     outputs.check_output("--out", args.out, (".csv",))
     outputs.check_apart([args.pairs, *filter(None, [args.target])], [args.out])
+    clouds.columns_of(args)
 
     from cfr_jax.batch.jobs import jobs_of
     from cfr_jax.data.layout import recognize
@@ -149,7 +159,9 @@ def run(args: argparse.Namespace) -> int:
         "refine": not args.no_refine,
         "second_look": not args.no_second_look,
         "max_points": args.max_points,
+        "all_points": not args.thinned,
         "seed": args.seed,
+        "columns": args.columns,
     }
     kept = out.with_suffix(".jsonl")
     outputs.check_output("--out", kept)
@@ -164,7 +176,7 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             print(
                 f"cfr batch: stopped; {kept} keeps what is done\n"
-                "the same command goes on from there",
+                "run the same command again to continue",
                 file=sys.stderr,
             )
             raise
@@ -172,7 +184,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _register(
-    jobs: Jobs, left: Sequence[int], journal: Journal, params: dict, args: argparse.Namespace
+    jobs: Jobs, left: Sequence[int], journal: Journal, params: Params, args: argparse.Namespace
 ) -> None:
     from cfr_jax.batch.records import as_record
     from cfr_jax.batch.stream import align_many
@@ -181,11 +193,12 @@ def _register(
     if not left:
         return
     outcomes = align_many(
-        (jobs[row].pair for row in left),
+        clouds.with_columns((jobs[row].pair for row in left), args),
         params=params,
         refine=not args.no_refine,
         second_look=not args.no_second_look,
         max_points=args.max_points,
+        all_points=not args.thinned,
         seed=args.seed,
         batch=args.batch_size,
         workers=args.workers,
@@ -234,7 +247,7 @@ def _tell(records: Iterable[dict[str, Any]], out: Path, kept: Path, strict: bool
     if count and failed == count:
         raise ValueError(
             f"none of the {count} pairs could be registered: {reasons[0][1]}\n"
-            f"mend the files and add --retry-failed; every reason is in {out}"
+            f"fix the files and add --retry-failed; every reason is in {out}"
         )
     return UNTRUSTED if strict and trusted < count else 0
 
@@ -257,7 +270,8 @@ def _shard(wish: str | None) -> Shard | None:
             jax.distributed.initialize()
     except (ValueError, RuntimeError) as error:
         raise ValueError(
-            "--shard auto: no cluster tells this process its number; give --shard I/N instead\n"
+            "--shard auto: found no cluster that gives this process a number; give --shard I/N "
+            "instead\n"
             f"({str(error).splitlines()[0]})"
         ) from None
     return process_shard()

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.cli.shared.numbers import not_negative, positive
 
 PAIRS = 500
@@ -34,7 +35,7 @@ Each pair takes about a second on a CPU.
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr calibrate`."""
     parser = commands.add_parser(
         "calibrate",
@@ -99,7 +100,9 @@ def run(args: argparse.Namespace) -> int:
     weights = read_weights(args.weights, "cfr")
     calibration = calibration_of(weights.params)
     if args.check and calibration is None:
-        raise ValueError(f"WEIGHTS: {args.weights} carries no calibration to check; give --out")
+        raise ValueError(
+            f"WEIGHTS: {args.weights} has no calibration to check; give --out to fit one"
+        )
     opened = trials.open_trials(args.data, args.seed)
     keep_compiled_programs()
     with Progress(total=args.pairs, desc="registering", unit=" pairs") as bar:
@@ -117,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         calibration = fitting.fit_calibration(found)
         chances = {name: fitting.cross_validated(found, name) for name in found.right}
-        print("fitted; measured on shapes or pairs that were left out of the fit in turn:")
+        print("fitted; the following is measured by cross-validation, on shapes or pairs left out:")
     curves = {name: (chances[name], right) for name, right in found.right.items()}
     for name, curve in curves.items():
         print(f"{name:<11} {reliability.in_words(reliability.summary(*curve))}")
@@ -136,7 +139,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuses what can be refused before anything is imported."""
+    """Checks the arguments, as far as that needs no imports."""
     written = []
     if args.out is not None:
         outputs.check_output("--out", args.out, (".safetensors",))

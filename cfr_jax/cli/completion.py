@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Callable
 from typing import Any
 
+from cfr_jax.cli.shared.commands import Commands
+
 SHELLS = ("bash", "zsh", "fish")
 
 _DESCRIPTION = """\
@@ -18,7 +20,7 @@ the options of `cfr` (pip install "cfr_jax[completion]"):
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr completion`."""
     parser = commands.add_parser(
         "completion",
@@ -47,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _complete_files(parser: argparse.ArgumentParser, file: Any) -> None:
-    """Arguments that are paths are completed as such, in every command."""
+    """Lets arguments that are paths complete to file names, in every command."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for command in action.choices.values():

@@ -1,4 +1,4 @@
-"""`cfr convert`: the authors' PyTorch weights, of CFR or RPM-Net, into ours."""
+"""`cfr convert`: converts the authors' PyTorch weights of a known network into ours."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 
 _DESCRIPTION = """\
 Converts a checkpoint of the CFR authors' PyTorch program into weights for this one:
@@ -13,15 +14,15 @@ Converts a checkpoint of the CFR authors' PyTorch program into weights for this 
   cfr convert authors.pth --out weights.safetensors
   cfr register a.ply b.ply --weights weights.safetensors
 
-A checkpoint of the RPM-Net authors' program is recognized by its names, and converted for
-evaluate.py, which compares the two.
+Checkpoints of the programs of RPM-Net, DCP (v1 and v2), FMR and RGM are recognized by the names
+of their tensors, and converted for evaluate.py, which compares these networks.
 
-A .pth or .pt file is read by PyTorch (pip install "cfr_jax[torch]"), tensors only: no code in
+A .pth, .pt or .t7 file is read by PyTorch (pip install "cfr_jax[torch]"), tensors only: no code in
 it is run. A .safetensors or .npz file of the same tensors under the same names needs no PyTorch.
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr convert`."""
     parser = commands.add_parser(
         "convert",
@@ -42,7 +43,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Converts, and notes in the file what it was made from."""
+    """Converts a checkpoint; notes in the new file say what it was made from."""
     outputs.check_output("--out", args.out, (".safetensors",))
     outputs.check_apart([args.checkpoint], [args.out])
 

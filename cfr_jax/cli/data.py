@@ -1,4 +1,4 @@
-"""`cfr data`: corpora of shapes, built and looked at."""
+"""`cfr data`: builds and shows corpora of shapes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.data.making.mesh_formats import mesh_formats
 from cfr_jax.io.formats import in_words
 
@@ -53,7 +54,7 @@ corpus is an HDF5 file in the layout of modelnet40_ply_hdf5_2048, or a folder of
 """
 
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
+def add_parser(subparsers: Commands) -> None:
     """Adds `cfr data` with its own commands."""
     style: dict[str, Any] = {
         "formatter_class": argparse.RawDescriptionHelpFormatter,
@@ -131,10 +132,10 @@ def _build(args: argparse.Namespace) -> int:
         ("--least-faces", args.least_faces, 1),
     ):
         if value < least:
-            raise ValueError(f"{option}: got {value}, wanted {least} at least")
+            raise ValueError(f"{option}: got {value}, wanted at least {least}")
     single = args.out.suffix == ".h5"
     if single and args.unseen is not None:
-        raise ValueError("--unseen: one file has no test split; give --out a folder")
+        raise ValueError("--unseen: a single file has no test split; let --out be a folder")
     _check_place(args.out, single)
 
     from cfr_jax.data.making.build import build, choose_unseen, folder_items
@@ -199,7 +200,7 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _check_place(out: Path, single: bool) -> None:
-    """Writable, and nothing else's: `shape_names.txt` and the splits will be replaced."""
+    """Raises ValueError unless a corpus can be written to `out`, where it replaces an older one."""
     if single:
         outputs.check_output("--out", out, (".h5",))
     elif out.is_dir():
@@ -218,10 +219,10 @@ def _print_report(report: Report, out: Path) -> None:
 
     few = sum(report.counts["val"].values()) if "val" in report.counts else ENOUGH
     if few < ENOUGH:
-        print(f"few         {few} shapes to validate on: with fewer than {ENOUGH}, which weights")
-        print("            are best is a matter of chance; more meshes, or another --unseen")
+        print(f"few         {few} shapes to validate on: with fewer than {ENOUGH}, the choice of")
+        print("            the best weights depends on chance; try more meshes or another --unseen")
     for why, count in report.reasons.most_common():
         print(f"left out    {count}: {why}")
     print(f"wrote       {out}")
     if report.left_out:
-        print(f"            {report.left_out_file}: what was left out, by name")
+        print(f"            {report.left_out_file}: the names of what was left out")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,7 +21,7 @@ places. Prints the motion, its quality, and its error against the known truth. W
 _PAIR = Path(__file__).parent / "demo_pair"
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr demo`."""
     parser = commands.add_parser(
         "demo",
@@ -40,7 +41,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Registers the pair, prints how well, draws it."""
+    """Registers the pair, prints the quality of the result, and draws it."""
     page, picture = args.out / "demo.html", args.out / "demo.png"
     args.out.mkdir(parents=True, exist_ok=True)
     for path in (page, picture):
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"{name:<11} {text}")
     scene = report.as_scene(result, facts=errors)
     viewer.write_page(page, scene)
-    print(f"\nwrote       {page} (open it in a browser, and turn it)")
+    print(f"\nwrote       {page} (open it in a browser and rotate it)")
     if outputs.can_draw():
         viewer.write_picture(picture, scene)
         print(f"wrote       {picture}")

@@ -1,4 +1,4 @@
-"""`cfr export`: the network as one StableHLO program, for hosts without this package."""
+"""`cfr export`: writes the network as one StableHLO program, for hosts without this package."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 
 _DESCRIPTION = """\
 Writes the network, with its weights inside, as one program that runs wherever JAX runs:
@@ -23,7 +24,7 @@ it from byte 32 on. The example checks the digest first, since JAX does not noti
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr export`."""
     parser = commands.add_parser(
         "export",

@@ -1,9 +1,11 @@
-"""`cfr models`: the weights that ship, what they were made of, and how well they do."""
+"""`cfr models`: lists the shipped weights, what they were trained on, and how good they are."""
 
 from __future__ import annotations
 
 import argparse
 import json
+
+from cfr_jax.cli.shared.commands import Commands
 
 _DESCRIPTION = """\
 Lists the weights that ship with the package: digest, parameters, the licenses of the data they were
@@ -11,7 +13,7 @@ trained on, and their measured scores. `cfr reproduce NAME` measures one of them
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr models`."""
     parser = commands.add_parser(
         "models",
@@ -50,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def scores_in_words(scores: dict[str, float]) -> str:
-    """Mean and median rotation error, and the shares of pairs that were solved."""
+    """The scores in words: mean and median rotation error, and the shares of solved pairs."""
     recalls = []
     for name, share in scores.items():
         if name.startswith("recall_"):

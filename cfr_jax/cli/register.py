@@ -1,4 +1,4 @@
-"""`cfr register SOURCE TARGET`: the motion from one file onto another."""
+"""`cfr register SOURCE TARGET`: finds the motion that lays one file on another."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import argparse
 import importlib.util
 import json
 import sys
-import textwrap
 from pathlib import Path
 from typing import Any
 
 from cfr_jax import refine
-from cfr_jax.cli.shared import numbers, outputs
-from cfr_jax.io import formats
+from cfr_jax.cli.shared import clouds, numbers, outputs
+from cfr_jax.cli.shared.commands import Commands
+from cfr_jax.runtime import optional
 
 UNTRUSTED = 3
 
@@ -49,13 +49,13 @@ examples:
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr register`."""
     parser = commands.add_parser(
         "register",
         help="find the motion that lays one point cloud on another",
         description=_DESCRIPTION,
-        epilog=_EPILOG.format(files=_files()),
+        epilog=_EPILOG.format(files=clouds.files_in_words()),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
@@ -68,7 +68,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--out",
         metavar="FILE",
         type=Path,
-        help=f"the moved source, all its points ({' '.join(outputs.cloud_suffixes())})",
+        help="the moved source with all that its file holds "
+        f"({' '.join(outputs.cloud_suffixes())})",
     )
     written.add_argument(
         "--json",
@@ -88,6 +89,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
 
     how = parser.add_argument_group("how to register")
+    clouds.add_columns(how)
     after = how.add_mutually_exclusive_group()
     after.add_argument(
         "--no-refine",
@@ -129,10 +131,12 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="most points of each cloud that the network sees; more are slower (default: chosen)",
     )
     how.add_argument(
-        "--all-points",
+        "--thinned",
         action="store_true",
-        help="refine further on every point of large clouds, after the thinned ones",
+        help="stop at the points that the network sees; otherwise, larger clouds are refined on "
+        "all of their points at the end",
     )
+    how.add_argument("--all-points", action="store_true", help=argparse.SUPPRESS)  # what it was
     how.add_argument(
         "--no-second-look",
         action="store_true",
@@ -152,29 +156,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
 
 
-def _files() -> str:
-    """The formats that are read, a line of each sort, wrapped."""
-    bare = [form for form in formats.known() if form.holds == "surface"]
-    either = [form for form in formats.known() if form.holds == "either"]
-    surfaces = f"{formats.in_words(bare)}, and {formats.in_words(either)} with faces: points are"
-    lines = {
-        "clouds": formats.in_words(formats.of_clouds()),
-        "surfaces": f"{surfaces} drawn from them by area",
-    }
-    return "\n".join(
-        textwrap.fill(
-            text,
-            width=100,
-            initial_indent=f"  {sort:10s}",
-            subsequent_indent=" " * 12,
-            break_on_hyphens=False,
-        )
-        for sort, text in lines.items()
-    )
-
-
+@clouds.telling("cfr register")
 def run(args: argparse.Namespace) -> int:
-    """Reads, registers, writes; whatever can be refused is refused before JAX is imported."""
+    """Reads, registers and writes; what can be checked is checked before JAX is imported."""
+    if args.all_points:
+        raise ValueError("--all-points: all points are used without it; --thinned turns that off")
     to_stdout = args.json == Path("-")
     _check_outputs(args, to_stdout)
 
@@ -187,7 +173,11 @@ def run(args: argparse.Namespace) -> int:
     if args.initial is not None:
         motions = [read_transform(path) for path in args.initial]
         initial = motions[0] if len(motions) == 1 else np.stack(motions)
-    source, target = io.read(args.source, seed=args.seed), io.read(args.target, seed=args.seed)
+    columns = clouds.columns_of(args)
+    source = io.read(
+        args.source, seed=args.seed, columns=columns[0], properties=args.out is not None
+    )
+    target = io.read(args.target, seed=args.seed, columns=columns[1])
 
     from cfr_jax.cli.shared import report
     from cfr_jax.cli.shared.cache import keep_compiled_programs
@@ -200,7 +190,7 @@ def run(args: argparse.Namespace) -> int:
         refine=False if args.no_refine else args.refine,
         initial=initial,
         max_points=args.max_points,
-        all_points=args.all_points,
+        all_points=not args.thinned,
         second_look=not args.no_second_look,
         seed=args.seed,
     )
@@ -208,6 +198,9 @@ def run(args: argparse.Namespace) -> int:
         io.write(args.out, result.moved_source())
     if args.json is not None:
         document = report.as_document(result, str(args.source), str(args.target))
+        for role, names in zip(("source", "target"), columns, strict=True):
+            if names is not None:
+                document[role]["columns"] = list(names)
         _write_json(None if to_stdout else args.json, document)
     if args.view is not None or args.png is not None:
         pictures = [path for path in (args.view, args.png) if path is not None]
@@ -237,9 +230,7 @@ def _check_outputs(args: argparse.Namespace, to_stdout: bool) -> None:
     chosen = refine.find(args.refine)
     library = None if chosen is None else chosen.library
     if library is not None and importlib.util.find_spec(library) is None:
-        raise ValueError(
-            f'--refine {args.refine} needs {library}: pip install "cfr_jax[baselines]"'
-        )
+        raise ValueError(f"--refine {args.refine} needs {library}: {optional.way_out(library)}")
     if args.png is not None:
         outputs.check_library("--png", args.png)
 

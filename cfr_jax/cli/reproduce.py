@@ -1,4 +1,4 @@
-"""`cfr reproduce NAME`: measures shipped weights again, on shapes that ship, too."""
+"""`cfr reproduce NAME`: measures shipped weights again, on shapes that also ship."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 from cfr_jax.cli import models
 from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared.commands import Commands
 
 FORMAT = "cfr_jax/reproduce/1"
 MISSED = 3
@@ -23,7 +24,7 @@ for the rounding of other processors.
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr reproduce`."""
     parser = commands.add_parser(
         "reproduce",
@@ -38,7 +39,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measures, and holds the scores against those of the card."""
+    """Measures the weights, and compares the scores with those on their card."""
     to_stdout = args.json == Path("-")
     told = sys.stderr if to_stdout else sys.stdout
     if args.json is not None and not to_stdout:

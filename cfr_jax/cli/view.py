@@ -1,11 +1,12 @@
-"""`cfr view RESULT.json`: the picture of a registration that was saved before."""
+"""`cfr view RESULT.json`: draws a registration that was saved before."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared import clouds, outputs
+from cfr_jax.cli.shared.commands import Commands
 
 _DESCRIPTION = """\
 Draws a result that `cfr register --json` wrote, without registering again:
@@ -22,7 +23,7 @@ register --view` shows them.
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds `cfr view`."""
     parser = commands.add_parser(
         "view",
@@ -50,12 +51,13 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 _SUFFIXES = (*outputs.PAGE_SUFFIXES, *outputs.PICTURE_SUFFIXES, *outputs.RECORDING_SUFFIXES)
 
 
+@clouds.telling("cfr view")
 def run(args: argparse.Namespace) -> int:
     """Reads the result and its clouds, and draws them."""
     wanted = args.out or [args.result.with_suffix(".html")]
     if not args.out and wanted[0].exists():
-        # perhaps the page of `cfr register --view`, which holds more
-        raise ValueError(f"{wanted[0]} is there already: name what to write with --out")
+        # perhaps the page of `cfr register --view`, which shows more
+        raise ValueError(f"{wanted[0]} already exists: name the file to write with --out")
     for path in wanted:
         outputs.check_output("--out", path, _SUFFIXES)
         outputs.check_library("--out", path)

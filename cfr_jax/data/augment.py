@@ -6,6 +6,7 @@ which the network works.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,6 +75,10 @@ class Sampling:
     """Standard deviation of the sensor noise at the center of the cloud."""
     estimated_normals: float = 0.0
     """Share whose normals are estimated from the noisy points, as for most users' clouds."""
+    copied: bool = False
+    """Whether both clouds are made of the same points of the shape, before crop and noise, as some
+    published trainings have it. That a point of one cloud lies exactly on one of the other is what
+    they then learn, and what no two scans have."""
 
     def __post_init__(self) -> None:
         for name in _SHARES:
@@ -106,6 +111,12 @@ class Sampling:
                 f"neighbors: got {self.neighbors}, wanted at least 1 and fewer than the "
                 f"{self.points} points"
             )
+
+
+def shared_count(sampling: Sampling, count: int) -> int:
+    """Of how many of a shape's `count` points both clouds are made, where they are copied: as many
+    as the deepest crop then leaves `sampling.points` of."""
+    return min(count, math.ceil(sampling.points / np.float32(sampling.keep[0])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +154,7 @@ def finish_pair(
     truth: Float[np.ndarray, "4 4"],
     sampling: Sampling,
     rng: np.random.Generator,
-) -> dict:
+) -> dict[str, Any]:
     """A training pair as a dict of arrays: both clouds with their neighbors, and the true motion.
 
     `truth` maps the source view onto the target view. The returned "transform" maps the returned

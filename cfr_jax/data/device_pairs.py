@@ -21,7 +21,7 @@ from flax import struct
 from jax import random
 from jaxtyping import Array, Bool, Float, Float16, Int8, Int32, Key, UInt32
 
-from cfr_jax.data.augment import SENSOR_AWAY, Sampling
+from cfr_jax.data.augment import SENSOR_AWAY, Sampling, shared_count
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.protocol import NOISE_CLIP, NOISE_SCALE
 from cfr_jax.geometry import neighbors, rigid
@@ -72,7 +72,7 @@ def draw_pairs(
     items: Int32[Array, " b"],
     positions: UInt32[Array, " b"],
     sampling: Sampling,
-) -> dict:
+) -> dict[str, Array]:
     """A batch in the format of `loader.batch_at`, with arrays (b, ...).
 
     Pair i is made from shape `items[i]` for position `positions[i]` of the stream. `sampling` is
@@ -80,7 +80,7 @@ def draw_pairs(
     """
     key = random.key(seed)
 
-    def one(item: Array, position: Array) -> dict:
+    def one(item: Array, position: Array) -> dict[str, Array]:
         return draw_pair(
             shapes.points[item], shapes.normals[item], random.fold_in(key, position), sampling
         )
@@ -93,7 +93,7 @@ def draw_pair(
     normals: Int8[Array, "p 3"],
     key: Key[Array, ""],
     sampling: Sampling,
-) -> dict:
+) -> dict[str, Array]:
     """A pair made from one shape, in the format of `augment.finish_pair`.
 
     It has both clouds (n, 3) float32, each with normals and neighbors (n, k), "transform" (4, 4),
@@ -103,6 +103,10 @@ def draw_pair(
     length = jnp.sqrt(jnp.sum(normals * normals, axis=1, keepdims=True))
     normals = normals / jnp.maximum(length, 1)
     of_pair, of_sides = random.split(key)
+    if sampling.copied:
+        score = random.uniform(random.fold_in(of_pair, 1), (len(points),))
+        rows = jnp.argsort(score)[: shared_count(sampling, len(points))]
+        points, normals = points[rows], normals[rows]
     drawn = _decide(of_pair, sampling)
 
     def cloud(key: Array, placed: Array) -> tuple[Array, Array, Array]:
@@ -233,7 +237,7 @@ def _crop(
     below = jnp.clip(jnp.floor(place), 0, count - 2)
     ordered, row = jnp.sort(height), below.astype(jnp.int32)
     plane = ordered[row] + (ordered[row + 1] - ordered[row]) * (place - below)
-    return height > jnp.where(keep == 0.5, 0, plane)
+    return (height > jnp.where(keep == 0.5, 0, plane)) | (keep >= 1)
 
 
 def _add_noise(

@@ -10,7 +10,7 @@ import collections
 import functools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int
@@ -24,12 +24,14 @@ class Source(Protocol):
 
     def __len__(self) -> int: ...
 
-    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
+    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
         """A pair made from item `index`, in the format of `augment.finish_pair`."""
         ...
 
 
-def batch_at(source: Source, position: int, size: int, sampling: Sampling, seed: int) -> dict:
+def batch_at(
+    source: Source, position: int, size: int, sampling: Sampling, seed: int
+) -> dict[str, np.ndarray]:
     """`size` pairs of the endless shuffled stream, starting at `position`; arrays (size, ...)."""
     pairs = []
     for number, item in zip(
@@ -70,7 +72,7 @@ def batches(
     seed: int,
     workers: int = 2,
     share: slice = slice(None),
-) -> Iterator[dict]:
+) -> Iterator[dict[str, np.ndarray]]:
     """`count` batches starting at `position`, prepared ahead of use by `workers` threads.
 
     Only the rows of each batch that are in `share` are made, so that each of several processes

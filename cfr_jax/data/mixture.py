@@ -40,7 +40,7 @@ class Mixture:
     def __len__(self) -> int:
         return sum(len(s) * r for s, r in zip(self.sources, self.repeats, strict=True))
 
-    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
+    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
         """A pair from the source that item `index` of the mixture belongs to."""
         source, index = self.locate(index)
         return source.draw(index, sampling, rng)
@@ -123,7 +123,7 @@ def check_readable(mixture: Mixture, cache: Path, where: str, remember: bool = T
 
 def fixed_pairs(
     mixture: Mixture, count: int, sampling: Sampling, neighbors: int, radius: float
-) -> dict:
+) -> dict[str, np.ndarray]:
     """The same `count` pairs on every call, spread over the sources, as one batch.
 
     Each source decides how its pairs are made. All clouds in a batch must have the same size, so
@@ -162,7 +162,7 @@ def _read_all(source: TrainingSource, check: Callable[[int], object], where: str
         )
 
 
-def _named(given: Any, where: str) -> dict[str, dict]:
+def _named(given: Any, where: str) -> dict[str, dict[str, Any]]:
     if isinstance(given, str | Path):
         return {"corpus": {"kind": "corpus", "path": given}}
     if not isinstance(given, dict) or not all(isinstance(about, dict) for about in given.values()):
@@ -170,7 +170,7 @@ def _named(given: Any, where: str) -> dict[str, dict]:
     return {name: dict(about) for name, about in given.items()}
 
 
-def _open(about: dict, cache: Path, where: str) -> TrainingSource:
+def _open(about: dict[str, Any], cache: Path, where: str) -> TrainingSource:
     name, path = about.pop("kind", "corpus"), about.pop("path", None)
     able = [kind for kind in kinds.known() if kind.train is not None]
     if name != "auto":

@@ -93,7 +93,7 @@ class PairFile(Sequence[Pair]):
         if isinstance(index, slice):
             return [self[row] for row in range(len(self))[index]]
         if not -len(self) <= index < len(self):
-            raise IndexError(f"index: got {index}, but {self.path} holds {len(self)} pairs")
+            raise IndexError(f"index: got {index}, wanted one of {len(self)} pairs")
         return self._read(range(len(self))[index])
 
     def _read(self, index: int) -> Pair:

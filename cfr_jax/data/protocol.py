@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -47,12 +48,12 @@ class Protocol:
             raise ValueError(f"keep: got {self.keep}, wanted None or a share between 0 and 1")
 
 
-clean = Protocol("clean", noise=False)
-noise = Protocol("noise")
-partial = Protocol("partial", keep=0.7)
-low_overlap = Protocol("low_overlap", keep=0.5)
-partial_both_ways = Protocol("partial_both_ways", keep=0.7, both_ways=True)
-partial_any_rotation = Protocol("partial_any_rotation", keep=0.7, angle=None)
+clean: Final = Protocol("clean", noise=False)
+noise: Final = Protocol("noise")
+partial: Final = Protocol("partial", keep=0.7)
+low_overlap: Final = Protocol("low_overlap", keep=0.5)
+partial_both_ways: Final = Protocol("partial_both_ways", keep=0.7, both_ways=True)
+partial_any_rotation: Final = Protocol("partial_any_rotation", keep=0.7, angle=None)
 PROTOCOLS = {
     made.name: made
     for made in (clean, noise, partial, low_overlap, partial_both_ways, partial_any_rotation)

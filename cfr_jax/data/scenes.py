@@ -12,6 +12,7 @@ import hashlib
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -61,7 +62,7 @@ class SceneSource:
         """`read`, which finds bad items in advance. Otherwise they are read only when drawn."""
         return self.read
 
-    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
+    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
         """A pair in the unit sphere, from a crop and a draw of points of each cloud."""
         pair = self.read(index)
         try:
@@ -76,7 +77,7 @@ class SceneSource:
         neighbors: int,
         radius: float,
         rng: np.random.Generator,
-    ) -> dict:
+    ) -> dict[str, Any]:
         """A recorded pair, thinned to `sampling.points` and rotated by up to 45 degrees about each
         axis.
 
@@ -97,7 +98,7 @@ class SceneSource:
             )
         return self.draw(index, chosen, rng)
 
-    def _draw(self, pair: Pair, sampling: Sampling, rng: np.random.Generator) -> dict:
+    def _draw(self, pair: Pair, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
         uneven = rng.random() < sampling.uneven
         clouds = []
         for points, normals in (

@@ -8,12 +8,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from cfr_jax.data import protocol
-from cfr_jax.data.augment import Sampling, View, choose_rows, finish_pair
+from cfr_jax.data.augment import Sampling, View, choose_rows, finish_pair, shared_count
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.loader import Source
 from cfr_jax.geometry.neighbors import nearest_on_host
@@ -56,7 +56,7 @@ class TrainingSource(Source, Protocol):
         neighbors: int,
         radius: float,
         rng: np.random.Generator,
-    ) -> dict:
+    ) -> dict[str, Any]:
         """A validation pair from item `index`, in the format of `augment.finish_pair`."""
         ...
 
@@ -81,13 +81,18 @@ class ShapeSource:
         digest.update(self.corpus.points[:, ::64].tobytes())
         return digest.hexdigest()
 
-    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict:
-        """A pair from one shape. Each cloud has its own crop and its own draw of points."""
+    def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
+        """A pair from one shape. Each cloud has its own crop, and its own draw of points unless
+        they are copied."""
         points, normals = self.corpus[index]
+        if sampling.copied:
+            rows = protocol.resample(len(points), shared_count(sampling, len(points)), rng)
+            points, normals = points[rows], normals[rows]
         uneven = rng.random() < sampling.uneven
         views = []
         for _ in range(2):
-            kept = protocol.crop(points, rng.uniform(*sampling.keep), rng)
+            keep = rng.uniform(*sampling.keep)
+            kept = protocol.crop(points, keep, rng) if keep < 1 else np.arange(len(points))
             rows = kept[choose_rows(points[kept], sampling, uneven, rng)]
             views.append(View(points[rows], normals[rows]))
         return finish_pair(views[0], views[1], np.eye(4), sampling, rng)
@@ -99,7 +104,7 @@ class ShapeSource:
         neighbors: int,
         radius: float,
         rng: np.random.Generator,
-    ) -> dict:
+    ) -> dict[str, Any]:
         """A pair by the published partial protocol, with 717 points. It ignores `sampling` and
         `rng`."""
         pair = protocol.fixed_pair(self.corpus, index, protocol.partial)

@@ -1,4 +1,4 @@
-"""Methods side by side on the same pairs: run, measured, tabulated, drawn.
+"""Compares methods on the same pairs: runs them, measures errors, writes tables and figures.
 
-Every method runs in a process of its own, which may crash or hang without harm to the rest.
+Every method runs in its own process, so that a crash or a hang does not harm the others.
 """

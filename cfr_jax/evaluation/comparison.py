@@ -1,4 +1,4 @@
-"""All methods of a configuration on its pairs, and the files that tell of it."""
+"""Runs all methods of a configuration on its pairs, and writes the results."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def compare(
     plots: bool = True,
     command: str = "",
 ) -> str:
-    """Runs the methods called `names` (none: all of the config's) and writes into `out`.
+    """Runs the methods called `names` (if empty, all of the config), and writes into `out`.
 
-    `results.json` holds every pair with every iteration, `table.md` what is returned; plots and
-    galleries lie beside them. `parts/` keeps the answers of each method: the same call goes on
-    where it stopped, and other methods or more pairs can join later. Raises ValueError for a config
-    or data that cannot be used.
+    `results.json` holds every pair with every iteration, and `table.md` the returned text; plots
+    and galleries are beside them. `parts/` keeps the answers of each method, so the same call
+    resumes where it stopped, and other methods or more pairs can be added later. Raises ValueError
+    for a config or data that cannot be used.
     """
     config = checked(config)
     methods = methods_of(config, names, config.seed)
@@ -44,7 +44,7 @@ def compare(
         from cfr_jax.evaluation.drawing.figures import draw_all, new_figure
         from cfr_jax.evaluation.drawing.gallery import draw_gallery
 
-        new_figure(1, 1)  # better missed now than after all methods have run
+        new_figure(1, 1)  # if matplotlib is missing, fail now and not after all methods have run
     pairs = read_pairs(config.data, config.limit, out / "cache")
     held = {
         m.name: run_method(m, pairs, out / "parts" / f"{m.name}.json", config.timeout)
@@ -140,7 +140,7 @@ def _of_pairs(
 
 
 def _errors_of(m: Measured, index: int) -> dict[str, Any]:
-    """Of one pair by every metric of the table's columns: of each iteration, or of the answer."""
+    """The errors of one pair by each metric of the table, per iteration or for the answer."""
     told: dict[str, Any] = {}
     for metric in metrics.table():
         if not any(summary.title for summary in metric.summaries):
@@ -152,5 +152,5 @@ def _errors_of(m: Measured, index: int) -> dict[str, Any]:
 
 
 def _number(value: float | None) -> float | None:
-    """JSON knows no NaN."""
+    """The value as JSON, which has no NaN: None if it is not finite."""
     return None if value is None or not np.isfinite(value) else float(value)

@@ -1,8 +1,8 @@
-"""What an evaluation is told: every field with its default, and its unit or its reason.
+"""The config of an evaluation: every field with its default, and its unit or the reason for it.
 
-A file in `configs/` states the data, the methods, and what differs from these defaults.
-`evaluate.py` sets fields by flags (`--config.data.protocol=clean`), one after the other and by the
-types written here; `checked` then looks at the whole.
+A file in `configs/` states the data, the methods, and what differs from these defaults. Flags of
+`evaluate.py` set single fields (`--config.data.protocol=clean`), one after the other, according to
+the types given here. `checked` then checks the whole config.
 """
 
 # No `from __future__ import annotations`: ml_collections reads the types of the fields.
@@ -19,43 +19,43 @@ Threshold = tuple[float, float]
 
 @dataclass(slots=True)
 class MethodEntry:
-    """A method of the table, and how it is run."""
+    """A row of the table: a method, and how to run it."""
 
-    use: str  # a name of `baselines.NAMES`, "truth", or a network of `networks.table`
-    options: dict[str, Any] = field(default_factory=dict)  # what it takes, by name
-    weights: str = ""  # of a network, instead of the config's; by name or path
-    threads: int | None = None  # cores of its process; None: the config's
-    batch: int = 1  # pairs a call, of networks
-    estimated_normals: bool = False  # even where the pairs have exact ones
-    modules: bool = False  # whether to time the parts of a network, too
+    use: str  # a name in `baselines.NAMES`, "truth", or a network in `networks.table`
+    options: dict[str, Any] = field(default_factory=dict)  # arguments of the method, by name
+    weights: str = ""  # weights of a network, by name or path; "": those of the config
+    threads: int | None = None  # cores of its process; None: as many as the config says
+    batch: int = 1  # pairs per call, for networks
+    estimated_normals: bool = False  # estimate normals even if the pairs have exact ones
+    modules: bool = False  # also time the parts of a network
 
     def __post_init__(self) -> None:
         check_types(self, "methods: ")
         if self.batch < 1:
             raise ValueError(f"methods: batch: got {self.batch}, wanted at least 1 pair")
-        # configs hand the same options to several methods, but a flag sets those of one
+        # configs pass the same options to several methods, but a flag sets those of only one
         self.options = copy.deepcopy(self.options)
 
 
 @dataclass(slots=True)
 class EvaluationConfig:
-    """All that `evaluate.py` reads."""
+    """Everything that `evaluate.py` reads."""
 
     title: str
     data: dict[str, Any]
-    """`kind` (one of `data.kinds`, or "auto": told from the layout), `path`, and the settings of
-    that kind: those that its `evaluate` takes."""
+    """`kind` (one of `data.kinds`, or "auto" to recognize it by its layout), `path`, and the
+    settings that the `evaluate` of this kind takes."""
     methods: dict[str, MethodEntry]
-    limit: int = 0  # pairs, from the first; 0 for all
-    seed: int = 0  # of the methods that draw, and of the intervals
-    weights: str = "object"  # of CFR; by name or path
-    rpmnet_weights: str = "rpmnet"  # RPM-Net is left out where there are none
+    limit: int = 0  # how many pairs, from the first; 0 for all
+    seed: int = 0  # for methods that draw random numbers, and for the intervals
+    weights: str = "object"  # weights of CFR, by name or path
+    rpmnet_weights: str = "rpmnet"  # by name or path; without them RPM-Net is left out
     threads: int = 2  # cores of each method's process; 0 for all
-    timeout: float = 60.0  # seconds a pair
-    unit: str = ""  # of lengths; "" for the unit sphere
-    thresholds: tuple[Threshold, ...] = ((1.0, 0.02), (1.0, 0.1), (5.0, 0.1))  # of the recalls
-    main_threshold: Threshold = (5.0, 0.1)  # of the plots
-    limits: Threshold = (15.0, 0.3)  # where the axes of the recall plots end
+    timeout: float = 60.0  # seconds per pair
+    unit: str = ""  # unit of lengths; "" for radii of the unit sphere
+    thresholds: tuple[Threshold, ...] = ((1.0, 0.02), (1.0, 0.1), (5.0, 0.1))  # for recalls
+    main_threshold: Threshold = (5.0, 0.1)  # for plots
+    limits: Threshold = (15.0, 0.3)  # ends of the axes in the recall plots
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -74,9 +74,9 @@ class EvaluationConfig:
 
 
 def checked(config: object) -> EvaluationConfig:
-    """A copy of a config, every value of which was checked.
+    """A copy of a config, with every value checked.
 
-    Raises ValueError, naming the field, for a value that cannot be used.
+    Raises a ValueError that names the field for a value that cannot be used.
     """
     if not isinstance(config, EvaluationConfig):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Where and with what a table was made."""
+"""The machine and the versions with which a table was made."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def describe() -> str:
 
 
 def commit() -> str:
-    """The commit of the source tree that runs, with a + where it was changed since."""
+    """The commit of the running source tree, with a + if it has uncommitted changes."""
     folder = Path(__file__).parent
     try:
         told = [
@@ -34,13 +34,13 @@ def commit() -> str:
 
 
 def stamp() -> dict[str, str]:
-    """What tells when, where and with which code something was measured."""
+    """When, where and with which code something was measured."""
     date = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
     return {"commit": commit(), "date": date, "machine": describe()}
 
 
 def versions() -> dict[str, str]:
-    """Versions of the libraries whose methods are compared, as far as they are installed."""
+    """The versions of the compared libraries that are installed."""
     found = {}
     for name in _TOLD:
         try:

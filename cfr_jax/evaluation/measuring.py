@@ -17,7 +17,7 @@ from cfr_jax.geometry.motions import nearest_motion
 
 
 class Statistic(NamedTuple):
-    """A number over a set of pairs, and its 95 % interval over such sets."""
+    """A number computed from a set of pairs, and its 95 % interval over such sets."""
 
     value: float
     low: float
@@ -26,12 +26,12 @@ class Statistic(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Errors of one method over P pairs, in degrees or the unit of the clouds; NaN if it failed."""
+    """Errors of one method on P pairs, in degrees or the unit of the clouds; NaN if it failed."""
 
     name: str
     errors: dict[str, Float[np.ndarray, "p _i"]]
-    """By the name of the metric; after each iteration the method tells of, or of the answer alone.
-    The last column is the answer. A metric that some pairs cannot be measured by is not there."""
+    """By the name of the metric, after each iteration that the method reports or for the answer
+    alone. The last column is the answer. A metric that does not apply to all pairs is absent."""
     seconds: Float[np.ndarray, " p"]
     failures: dict[int, str]
     about: dict[str, Any]
@@ -54,20 +54,20 @@ class Measured:
         return np.isfinite(self.err_r[:, -1])
 
     def recalled(self, angle: float, distance: float) -> Bool[np.ndarray, " p"]:
-        """Which pairs are solved to this accuracy; a failure is not."""
+        """Which pairs are solved to this accuracy; failures are not."""
         return metrics.recalled(self.err_r[:, -1], self.err_t[:, -1], angle, distance)
 
     def milliseconds(self) -> float:
-        """Median over the pairs answered; NaN where there are none."""
+        """Median time over the answered pairs; NaN if there are none."""
         known = self.seconds[self.answered]
         return float(np.median(known) * 1e3) if len(known) else np.nan
 
 
 def measure(name: str, records: Records, pairs: Sequence[Pair]) -> Measured:
-    """The errors of what `records` holds of all pairs.
+    """The errors of the answers in `records`, for all pairs.
 
-    Estimates are made exactly rigid first, as the truths are: their rounding to float32 would read
-    as hundredths of a degree.
+    Estimates are made exactly rigid first, like the truths: rounding to float32 would show up as
+    hundredths of a degree.
     """
     answers = {
         index: nearest_motion(np.array(record.transforms))
@@ -100,7 +100,7 @@ def measure(name: str, records: Records, pairs: Sequence[Pair]) -> Measured:
 
 
 def only(measured: Measured, rows: Int[np.ndarray, " k"]) -> Measured:
-    """The same of some of the pairs."""
+    """The same errors for some of the pairs."""
     places = {int(row): place for place, row in enumerate(rows)}
     return dataclasses.replace(
         measured,
@@ -113,9 +113,9 @@ def only(measured: Measured, rows: Int[np.ndarray, " k"]) -> Measured:
 def summarize(
     measured: Measured, thresholds: Sequence[tuple[float, float]], seed: int
 ) -> dict[str, Statistic | None]:
-    """All summaries of the metrics over the pairs answered, and recalls over all pairs.
+    """All summaries of the metrics over the answered pairs, and the recalls over all pairs.
 
-    Each with its bootstrap interval; None where nothing was answered or is not measured.
+    Each comes with its bootstrap interval. It is None if no pair was answered or measured.
     """
     answered = measured.answered
     numbers: dict[str, Statistic | None] = {}
@@ -138,10 +138,11 @@ def bootstrap(
     resamples: int = 2000,
     seed: int = 0,
 ) -> Statistic:
-    """A statistic with its 95 % percentile interval (Efron, 1979) over drawing the pairs anew.
+    """A statistic with its 95 % bootstrap interval by percentiles (Efron, 1979).
 
-    `statistic` takes an array and an `axis`. The same seed draws the same pairs, so the intervals
-    of two methods on one set of pairs are comparable.
+    Resamples the pairs with replacement. `statistic` takes an array and an `axis`. The same seed
+    draws the same pairs, so the intervals of two methods on one set of pairs are comparable. Raises
+    ValueError for values that are not finite, and for no values.
     """
     values = np.asarray(values, np.float64)
     if not np.isfinite(values).all():

@@ -1,4 +1,4 @@
-"""What a configuration calls a method, as something a process of its own can make and run."""
+"""Turns the methods of a configuration into objects that another process can build and run."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from cfr_jax.networks import table
 
 OWN = "cfr"
 TRUTH = "truth"
-# Whose seed changes the answer.
+# Methods whose answer depends on the seed.
 _DRAWING = {"fgr", "fgr_icp", "ransac"}
-# Files that decide the answers of the peers, and of those methods that are made of our own code.
+# Files that decide the answers of the peers, and of the methods that use our own code.
 _PEERS = ("evaluation/baselines/*.py", "data/scans.py")
 _OURS = (
     *_PEERS,
@@ -44,23 +44,24 @@ class Method:
     make: Callable[[], Solver]
     """Called in the method's own process, so it must be picklable."""
     about: dict[str, Any]
-    """All that decides the answers, as JSON: what stored answers must have been made with."""
+    """Everything that decides the answers, as JSON. Stored answers are used only if they were made
+    with the same."""
     batch: int = 1
     threads: int = 0
     """How many cores its process may use; 0 for all."""
     missing: str | None = None
-    """Why it cannot be run at all."""
+    """Why it cannot run at all."""
     modules: Callable[[], Callable[[Sequence[Pair]], list[dict[str, float]]]] | None = None
-    """Makes what times the parts of the method, in seconds a pair."""
+    """Makes a function that times the parts of the method, in seconds per pair."""
 
 
 def methods_of(config: EvaluationConfig, names: Sequence[str], seed: int) -> list[Method]:
-    """The methods called `names` in `config.methods`, in the order given; all by name if none are.
+    """The methods called `names` in `config.methods`, in this order; if empty, all, sorted by name.
 
-    A network has its entry's `weights`; without, CFR has the config's, and RPM-Net its
-    `rpmnet_weights`. Where weights of a network's own are not there, or RPM-Net's, the method is
-    left out. Raises ValueError for unknown methods, for a network without weights, and for weights
-    that are not sound.
+    A network uses the `weights` of its entry. If the entry names none, CFR uses `config.weights`
+    and RPM-Net `config.rpmnet_weights`. If weights are not found, the method is left out, unless
+    they are those of `config.weights`. Raises ValueError for unknown methods, for a network without
+    weights, and for damaged weights.
     """
     known = sorted(config.methods)
     unknown = [name for name in names if name not in known]
@@ -91,7 +92,8 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
 
         own = entry.weights or (None if use == OWN else getattr(config, f"{use}_weights", ""))
         if own == "":
-            raise ValueError(f"methods.{name}: lacks the weights of {table.network(use).title}")
+            title = table.network(use).title
+            raise ValueError(f"methods.{name}.weights: got none, wanted weights of {title}")
         source = own or config.weights
         try:
             weights = read_weights(source, use)
@@ -126,7 +128,7 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
 
 
 def make_baseline(use: str, options: dict[str, Any], estimated: bool) -> Solver:
-    """A baseline as a solver, pair after pair."""
+    """A baseline as a solver; it runs pair by pair."""
     register = baseline(use)
 
     def solve(pairs: Sequence[Pair]) -> list[Answer]:
@@ -142,7 +144,7 @@ def make_baseline(use: str, options: dict[str, Any], estimated: bool) -> Solver:
 
 
 def _make_truth() -> Solver:
-    """Not a method: what the table must say of a perfect one."""
+    """Answers with the truth: what the table must show for a perfect method."""
     return lambda pairs: [Answer(np.array(pair.transform)[None], 0.0) for pair in pairs]
 
 

@@ -1,10 +1,12 @@
-"""How far an estimated motion is from the truth, what a set of such errors says, and the table of
-these metrics, which everything that measures or shows looks up. A new metric is one entry there.
+"""Metrics: how far an estimated motion is from the truth, and how to summarize such errors.
 
-Everything is float64 numpy on the host, over P pairs at a time. Motions are (4, 4), map source onto
-target, and are rigid; lengths are in the unit of the clouds, angles in degrees.
+All metrics are in one table, which everything that measures or shows errors looks up. A new metric
+is one entry in it.
 
-The definitions are those of RPM-Net (Yew & Lee, 2020), so that numbers stand beside published ones.
+Everything is float64 numpy on the host, for P pairs at a time. Motions are (4, 4), rigid, and map
+source onto target. Lengths are in the unit of the clouds, angles in degrees.
+
+The definitions are those of RPM-Net (Yew & Lee, 2020), so the numbers compare with published ones.
 """
 
 from __future__ import annotations
@@ -26,11 +28,11 @@ Errors = Float[np.ndarray, " _pairs"]
 
 
 def err_r(estimates: Motions, truths: Motions) -> Errors:
-    """Angle of the rotation left between estimate and truth, in degrees.
+    """Angle of the rotation that remains between estimate and truth, in degrees.
 
-    arccos((tr(R_truth^T R) - 1) / 2) as published. It cannot see small angles: an error e in the
-    trace reads as sqrt(e). Equal float64 rotations answer up to 5e-6 degrees, and rotations
-    rounded to float32 up to 0.03.
+    arccos((tr(R_truth^T R) - 1) / 2), as published. It is inexact for small angles: an error e in
+    the trace appears as sqrt(e). Equal rotations in float64 can measure up to 5e-6 degrees, and
+    equal rotations rounded to float32 up to 0.03.
     """
     estimates, truths = _checked(estimates, truths)
     trace = np.einsum("pij,pij->p", truths[:, :3, :3], estimates[:, :3, :3])
@@ -38,7 +40,7 @@ def err_r(estimates: Motions, truths: Motions) -> Errors:
 
 
 def err_t(estimates: Motions, truths: Motions) -> Errors:
-    """Length of the translation of truth^-1 after the estimate, which is that of the difference."""
+    """Length of the translation of truth^-1 estimate; equal to that of the difference of both."""
     estimates, truths = _checked(estimates, truths)
     return np.linalg.norm(estimates[:, :3, 3] - truths[:, :3, 3], axis=-1)
 
@@ -72,10 +74,10 @@ def chamfer(
     clean_source: Float[np.ndarray, "k 3"],
     clean_target: Float[np.ndarray, "l 3"],
 ) -> float:
-    """Modified Chamfer distance of one pair, squared: each cloud against the other's whole shape.
+    """Modified Chamfer distance of one pair, squared: from each cloud to the other's whole shape.
 
-    The clean clouds are without noise and crop, each in the frame of its cloud, so a good estimate
-    is not charged for what a crop took away.
+    The clean clouds have no noise and no crop, and each is in the frame of its cloud. So a good
+    estimate is not penalized for what the crop removed.
     """
     clouds = [
         _finite("source", source),
@@ -98,15 +100,15 @@ def recalled(
 
 
 def root_mean_square(values: np.ndarray, axis: int) -> np.ndarray | np.floating:
-    """A statistic for `bootstrap`: the root over all axes of all pairs, not a mean of roots."""
+    """A statistic for `bootstrap`: one root over all axes of all pairs, not a mean of roots."""
     return np.sqrt(np.square(values).mean(axis=axis))
 
 
 def _euler_difference(estimates: Motions, truths: Motions) -> Float[np.ndarray, "p 3"]:
-    """Not wrapped at 180 degrees, as in the published numbers."""
+    """Differences of the Euler angles, not wrapped at 180 degrees, as in the published numbers."""
     estimates, truths = _checked(estimates, truths)
     with warnings.catch_warnings():
-        # At gimbal lock one of the equal choices of angles is as good as another.
+        # At gimbal lock, several choices of angles describe the same rotation; any will do.
         warnings.filterwarnings("ignore", message="Gimbal lock")
         angles = [
             Rotation.from_matrix(motions[:, :3, :3]).as_euler("xyz", degrees=True)
@@ -133,45 +135,45 @@ def _finite(name: str, values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Summary:
-    """A number that sums errors up over pairs."""
+    """A number that summarizes errors over pairs."""
 
     name: str
-    """As in results.json and on the cards of weights."""
+    """The name in results.json and on the cards of weights."""
     statistic: Callable[..., np.ndarray | np.floating]
     """Takes an array and an `axis`."""
     title: str | None = None
-    """Of its column in the table; without one it stands in results.json alone."""
+    """The title of its column in the table; None: it appears only in results.json."""
     scale: float = 1.0
     form: str = ".3f"
-    """How the table writes it, times `scale`."""
+    """The format in which the table writes it, after multiplying by `scale`."""
 
 
 @dataclass(frozen=True)
 class Metric:
-    """One way to say how good the estimates of a pair are."""
+    """One way to measure how good the estimates for a pair are."""
 
     name: str
     of: Callable[[Motions, Pair], Errors]
     """Errors of several estimates (i, 4, 4) of one pair."""
     label: str
-    """What it is, for plots."""
+    """Its description in plots."""
     unit: str | None
     """None for the unit of the clouds."""
     summaries: tuple[Summary, ...]
     lower_is_better: bool = True
     each_iteration: bool = False
-    """Whether it is told after every iteration, and not only of the answer."""
+    """Whether it is measured after every iteration, not only for the answer."""
     whole_shapes: bool = False
-    """Whether pairs have to know the whole shapes that their clouds are parts of."""
+    """Whether it needs the whole shapes that the clouds of a pair are parts of."""
 
     def axis_label(self, unit: str) -> str:
-        """What a plot writes at its axis, where the clouds are in `unit`."""
+        """The label of its axis in a plot, for clouds in `unit`."""
         return f"{self.label} ({self.unit or unit})"
 
 
 def _to_truth(function: Callable[[Motions, Motions], Errors]) -> Callable[[Motions, Pair], Errors]:
     def of(estimates: Motions, pair: Pair) -> Errors:
-        assert pair.transform is not None  # a metric of the truth is for pairs that have one
+        assert pair.transform is not None  # only pairs with a truth are measured
         return function(estimates, np.broadcast_to(pair.transform, estimates.shape))
 
     return of
@@ -228,24 +230,24 @@ def table() -> tuple[Metric, ...]:
 
 
 def metric(name: str) -> Metric:
-    """The metric of that name; KeyError where there is none."""
+    """The metric of that name; raises KeyError for an unknown name."""
     return _TABLE[name]
 
 
 def add(new: Metric) -> None:
-    """Puts a metric into the table. Raises ValueError where its name is taken."""
+    """Adds a metric to the table. Raises ValueError if its name is taken."""
     if new.name in _TABLE:
         raise ValueError(f"name: got {new.name!r}, wanted one that is not taken")
     _TABLE[new.name] = new
 
 
 def recall(angle: float, distance: float, unit: str = "") -> Summary:
-    """The share of pairs that are `recalled`; within (5, 0.1) it is called `recall_5deg_0.1`."""
+    """The share of pairs that are `recalled`; for (5, 0.1) its name is `recall_5deg_0.1`."""
     title = f"recall {angle:g}°, {distance:g}{' ' + unit if unit else ''}"
     return Summary(f"recall_{angle:g}deg_{distance:g}", np.mean, title)
 
 
 def lower_is_better(name: str) -> bool:
-    """Whether that is so of the summary of this name. More than recalls there is none to raise."""
+    """Whether a lower value of the summary of this name is better; false for recalls."""
     of = (m.lower_is_better for m in _TABLE.values() for s in m.summaries if s.name == name)
     return next(of, False)

@@ -1,4 +1,4 @@
-"""Measures weights again on the shapes that ship, so that a published score can be held to it."""
+"""Measures weights again on the shapes that ship with the package, to check published scores."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.pairs import Pair
 from cfr_jax.data.protocol import Protocol, fixed_pair, partial
 from cfr_jax.evaluation import metrics
+from cfr_jax.networks.record import Params
 from cfr_jax.weights.cards import FOLDER
 
 SHAPES = FOLDER / "held_out.npz"
@@ -20,7 +21,7 @@ WHAT = (
     f"{PAIRS} partial, noisy pairs of 24 CC0 shapes of unseen categories, 717 points, normals "
     "estimated from the points"
 )
-# What another processor's rounding may move: a pair on the brink, and hundredths of a degree.
+# Room for the rounding of other processors, which can move a borderline pair.
 TOLERANCE = {
     "err_r_mean": 1.0,
     "err_r_median": 0.25,
@@ -32,7 +33,7 @@ Scores = dict[str, dict[str, float]]
 
 
 def read_shapes() -> Corpus:
-    """The held-out shapes (`weights/shipped/held_out.md` has the credits)."""
+    """The held-out shapes (credits are in `weights/shipped/held_out.md`)."""
     with np.load(SHAPES, allow_pickle=False) as held:
         categories = tuple(sorted(set(held["categories"].tolist())))
         normals = held["normals"].astype(np.float32)
@@ -46,16 +47,16 @@ def read_shapes() -> Corpus:
 
 
 def make_pairs(count: int = PAIRS, protocol: Protocol = partial) -> list[Pair]:
-    """The first `count` pairs; every shape comes again with another crop, motion and noise."""
+    """The first `count` pairs; when a shape comes again, its crop, motion and noise are new."""
     shapes = read_shapes()
     rows = np.arange(count) % len(shapes)
     return [fixed_pair(shapes.take(rows), index, protocol) for index in range(count)]
 
 
-def measure(params: dict, told: Callable[[], Any] = lambda: None, count: int = PAIRS) -> Scores:
-    """Scores of the network alone and refined; `told` is called after every pair.
+def measure(params: Params, told: Callable[[], Any] = lambda: None, count: int = PAIRS) -> Scores:
+    """Scores of the network alone and after refinement; `told` is called after every pair.
 
-    Pairs without an answer count as turned by 180 degrees.
+    A pair without an answer counts as a rotation error of 180 degrees and a translation error of 2.
     """
     pairs = make_pairs(count)
     clouds = ((pair.source, pair.target) for pair in pairs)
@@ -74,7 +75,7 @@ def measure(params: dict, told: Callable[[], Any] = lambda: None, count: int = P
 
 
 def missed(measured: Scores, expected: Scores, tolerance: dict[str, float]) -> list[str]:
-    """What is worse than expected by more than the tolerance; a better score holds, too."""
+    """The scores that are worse than expected by more than the tolerance, in words."""
     worse = []
     for stage, scores in expected.items():
         for name, value in scores.items():

@@ -1,4 +1,4 @@
-"""Runs a method on pairs: in batches, with progress, resuming, and going on after failures."""
+"""Runs a method on pairs: in batches, with a progress bar; can resume, and survives failures."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ _MODULE_PAIRS = 9
 
 
 def run_method(method: Method, pairs: Sequence[Pair], path: Path, timeout: float) -> Records:
-    """The records of all pairs; those that `path` already holds are not made again.
+    """The records of all pairs; those already in `path` are not made again.
 
-    A method that raises, crashes, takes more than `timeout` seconds or answers no rigid motion has
-    failed on that pair, and goes on with the next. Of a batch that fails, each pair is tried alone.
+    If a method raises an error, crashes, takes more than `timeout` seconds, or returns something
+    that is not a rigid motion, it fails on that pair and continues with the next. If a batch fails,
+    each of its pairs is tried alone.
     """
     if method.missing is not None:
         tqdm.write(f"{method.name} is left out: {method.missing}")
         return Records(method.about, missing=method.missing)
     digests = [store.digest(pair) for pair in pairs]
     held = store.load(path, method.about, digests)
-    # The method is not told the whole shapes.
+    # The method must not see the whole shapes.
     given = [dataclasses.replace(pair, clean_source=None, clean_target=None) for pair in pairs]
     todo = [index for index in range(len(pairs)) if index not in held.by_pair]
     saved = time.monotonic()
@@ -69,8 +70,8 @@ def run_method(method: Method, pairs: Sequence[Pair], path: Path, timeout: float
 
 
 def _time_modules(method: Method, pairs: Sequence[Pair], timeout: float) -> dict[str, float] | None:
-    """Seconds a pair of each part of the method, medians of some pairs; None where that fails."""
-    modules: Any = method.modules  # a worker passes on whatever is answered, here seconds
+    """Seconds per pair of each part of the method (medians of some pairs); None if that fails."""
+    modules: Any = method.modules  # a worker passes on any answer, here seconds
     timed = dataclasses.replace(method, make=modules)
     try:
         with Worker(timed) as worker:
@@ -104,7 +105,7 @@ def _solve(
 def _record(pair: str, answer: Answer) -> Record:
     transforms = np.asarray(answer.transforms, np.float64)
     if transforms.ndim != 3 or transforms.shape[1:] != (4, 4) or not len(transforms):
-        return Record(pair, failure=f"answered an array {transforms.shape}, wanted (i, 4, 4)")
+        return Record(pair, failure=f"returned an array {transforms.shape}, wanted (i, 4, 4)")
     if not are_rigid(transforms).all():
-        return Record(pair, failure="answered no rigid motion")
+        return Record(pair, failure="returned a motion that is not rigid")
     return Record(pair, transforms.tolist(), float(answer.seconds))

@@ -1,12 +1,14 @@
-"""Shapes that lie almost as well on themselves another way: no method can tell which way is meant.
+"""Nearly symmetric shapes, which fit on themselves in another position almost as well.
 
-The rule looks at the whole shape alone, never at an answer. A shape counts as nearly symmetric when
-some rotation lays it on itself about as closely as a second sampling of it would lie on the first:
-when the Chamfer distance between the shape and its rotated copy is at most `LIMIT` times the one
-that sampling alone makes. Tried are turns by 180, 120 and 72 degrees (every finite rotation group
-contains one by 360/p degrees, p prime, and a continuous one contains all) about the principal axes
-and the axes of the shape's own coordinates, through the centroid, each improved by a few steps of
-point-to-point ICP.
+No method can know which position is meant. The rule looks only at the whole shape, never at an
+answer. A shape counts as nearly symmetric if some rotation of it fits the shape about as closely as
+a second sampling of the shape would: if the Chamfer distance between the shape and its rotated copy
+is at most `LIMIT` times the distance that sampling alone causes.
+
+The rule tries rotations by 180, 120 and 72 degrees through the centroid, about the principal axes
+and the axes of the shape's coordinates. (Every finite rotation group contains a rotation by 360/p
+degrees for a prime p, and a continuous group contains all of them.) It improves each rotation by a
+few steps of point-to-point ICP.
 """
 
 from __future__ import annotations
@@ -32,16 +34,16 @@ from cfr_jax.runtime.atomic import write_atomically
 
 LIMIT = 2.0
 _TURNS = (180.0, 120.0, 72.0)  # degrees
-_LEAST = 30.0  # what ends closer to where it began is no other way to lie
-_SOME = 512  # points that choose among the turns
-_TRIED = 4  # turns that are improved
+_LEAST = 30.0  # degrees; smaller rotations do not count as another position
+_SOME = 512  # points that choose among the rotations
+_TRIED = 4  # rotations that are improved
 _STEPS = 10
 
 
 def nearly_symmetric(pairs: Sequence[Pair], cache: Path) -> Bool[np.ndarray, " p"] | None:
-    """Which pairs are of such shapes; None where the pairs know no whole shapes.
+    """Which pairs show nearly symmetric shapes; None if the pairs have no whole shapes.
 
-    The file `cache` keeps what was found, by the points of the shape and the rule.
+    The file `cache` keeps the results, by the points of the shape and the rule.
     """
     if any(pair.clean_target is None for pair in pairs):
         return None
@@ -60,11 +62,11 @@ def nearly_symmetric(pairs: Sequence[Pair], cache: Path) -> Bool[np.ndarray, " p
 
 
 def asymmetry(points: Float[np.ndarray, "n 3"]) -> float:
-    """Chamfer distance of the shape and its best rotated copy, over that of two samplings of it.
+    """Chamfer distance of a shape to its best rotated copy, divided by that of two samplings of it.
 
-    Squared distances, summed over both directions. The second is twice the mean squared distance of
-    a point to the nearest other one. About 1 for a symmetric shape; 0 / 0, a shape without extent,
-    counts as symmetric.
+    Both are squared distances, summed over both directions. The second is estimated as twice the
+    mean squared distance from a point to its nearest neighbor. The ratio is about 1 for a symmetric
+    shape. For a shape without extent it would be 0 / 0, and is 1.
     """
     points = np.asarray(points, np.float64)
     points = points - points.mean(axis=0)
@@ -93,7 +95,7 @@ def asymmetry(points: Float[np.ndarray, "n 3"]) -> float:
 def _closer(
     points: Float[np.ndarray, "n 3"], tree: cKDTree, rotation: Float[np.ndarray, "3 3"]
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "n 3"]]:
-    """The rotation after some steps of ICP, and the points moved by the motion it belongs to."""
+    """The rotation after some steps of ICP, and the points after the whole motion."""
     some = points[:: max(1, len(points) // _SOME)]
     shift = np.zeros(3)
     for _ in range(_STEPS):

@@ -1,7 +1,7 @@
-"""A method in a process of its own, which may crash or hang without taking the run along.
+"""Runs a method in its own process, so that a crash or a hang does not end the whole run.
 
 Nothing numerical is imported at the top: the process first limits itself to its cores, and the
-libraries that it imports afterwards size their thread pools by that.
+libraries that it imports afterwards size their thread pools accordingly.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from cfr_jax.evaluation.methods import Method
     from cfr_jax.evaluation.solvers.solver import Answer
 
-START_UP = 600.0  # seconds that importing may take, and then compiling
+START_UP = 600.0  # seconds that imports may take, and then again compilation
 
 
 class Failed(RuntimeError):
-    """The method did not answer: it raised, crashed, or took too long."""
+    """The method gave no answer: it raised an error, crashed, or took too long."""
 
 
 class Missing(RuntimeError):
@@ -33,10 +33,10 @@ class Missing(RuntimeError):
 
 @dataclass(frozen=True)
 class Started:
-    """What a process tells of itself once it is warm."""
+    """What a process reports about itself after its first call."""
 
     seconds: float
-    """Imports, compilation, and what else only the first call costs."""
+    """Time for imports, compilation, and whatever else only the first call needs."""
     threads: int
     device: str
 
@@ -58,14 +58,18 @@ class Worker:
         self.stop()
 
     def solve(self, pairs: Sequence[Pair], timeout: float) -> list[Answer]:
-        """The answers, or `Failed` (also after `timeout` seconds a pair), or `Missing`."""
+        """The answers to all pairs.
+
+        Raises `Failed` if the method fails or takes more than `timeout` seconds per pair, and
+        `Missing` if it cannot run at all.
+        """
         allowed = timeout * len(pairs)
         if self._process is None:
             self._start()
         if not self._warm:
-            # the first call is made twice, and the first time nobody knows what else it costs
+            # the first call solves twice, and at first its start-up time is unknown
             allowed += allowed + (START_UP if self.started is None else 3 * self.started.seconds)
-        late = f"no answer within {timeout:g} s a pair"
+        late = f"no answer within {timeout:g} s per pair"
         answers, self.started = self._reply(list(pairs), allowed, late)
         self._warm = True
         return answers
@@ -85,7 +89,7 @@ class Worker:
             raise
 
     def _reply(self, request: Any, seconds: float, late: str) -> Any:
-        """What the process answers to a request; None asks only whether it is up."""
+        """The answer of the process to a request; None only asks whether it has started."""
         try:
             if request is not None:
                 self._pipe.send(request)
@@ -116,7 +120,7 @@ class Worker:
 
 
 def _serve(pipe: Any, make: Any, threads: int) -> None:
-    """The child: makes the method, then solves what comes through the pipe until it closes."""
+    """The child process: makes the method, then solves pairs from the pipe until it closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends us
     threads = limit_threads(threads)
     began = time.perf_counter()
@@ -143,12 +147,12 @@ def _attempt(action: Any, *arguments: Any) -> tuple[str, Any]:
         return "done", action(*arguments)
     except ModuleNotFoundError as error:
         return "missing", str(error)
-    except Exception as error:  # whatever a method may raise, it is that method's failure
+    except Exception as error:  # whatever a method raises, only that method fails
         return "failed", f"{type(error).__name__}: {error}"
 
 
 def _first_call(solve: Any, pairs: Any, made: float, threads: int) -> tuple[Any, Started]:
-    """Solves twice: what the first call takes longer belongs to starting up."""
+    """Solves twice: the extra time of the first call counts as start-up time."""
     times = [time.perf_counter()]
     for _ in range(2):
         answers = solve(pairs)
@@ -158,7 +162,7 @@ def _first_call(solve: Any, pairs: Any, made: float, threads: int) -> tuple[Any,
 
 
 def limit_threads(threads: int) -> int:
-    """Keeps this process on its first `threads` cores (0: all it has); returns how many it has."""
+    """Limits this process to its first `threads` cores (0: all); returns how many it then has."""
     if not hasattr(os, "sched_setaffinity"):
         return os.cpu_count() or 1
     cores = sorted(os.sched_getaffinity(0))

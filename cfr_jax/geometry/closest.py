@@ -70,7 +70,9 @@ def _closest_by_differences(
     return lax.argmin(square, 1, jnp.int32)
 
 
-def squares(queries: Float[Array, "... 3"], points: Float[Array, "... 3"]) -> Float[Array, ...]:
+def squares(
+    queries: Float[Array, "... 3"], points: Float[Array, "... 3"]
+) -> Float[Array, "*shape"]:
     """Squared distances from differences.
 
     The expansion |a|^2 - 2ab + |b|^2 would lose all digits for close points far from the origin.

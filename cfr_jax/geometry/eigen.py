@@ -53,15 +53,16 @@ def leading_eigenvector(
     """An eigenvector for the largest eigenvalue of a symmetric matrix with trace zero.
 
     Its length is arbitrary but not zero. If several eigenvalues are the largest, it is a vector of
-    their common eigenspace; for the zero matrix it is the first axis. Like `symmetric_eigen`, not
-    meant to be differentiated.
+    their common eigenspace; for the zero matrix it is the first axis. `squarings` is even. Like
+    `symmetric_eigen`, not meant to be differentiated.
     """
     identity = jnp.eye(len(matrix), dtype=matrix.dtype)
     size = jnp.sqrt(jnp.sum(matrix * matrix))
     # Because the eigenvalues sum to zero, adding half the norm makes the largest one exceed the
     # absolute value of the smallest, so that it also dominates the powers.
-    lifted = jnp.where(size > 0, matrix + size / 2 * identity, jnp.diag(identity[0]))
-    power = _repeated(_squared, squarings, lifted)
+    small = matrix / jnp.where(size > 0, size, 1)
+    lifted = jnp.where(size > 0, small + identity / 2, jnp.diag(identity[0]))
+    power = _repeated(_squared_twice, squarings // 2, lifted)
     vector = power[jnp.argmax(jnp.diagonal(power))]
     for _ in range(2):  # multiplying by the matrix itself reduces the squarings' rounding errors
         vector = jnp.sum(lifted * vector, axis=1)
@@ -104,9 +105,12 @@ def _repeated(step: Callable[[Any, Any], Any], count: int, state: Any) -> Any:
 
 
 @jax.jit
-def _squared(_: Any, power: Float[Array, "d d"]) -> Float[Array, "d d"]:
+def _squared_twice(_: Any, power: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """The fourth power, its trace one again: a single kernel of an accelerator, as two squarings
+    with a trace each would be two."""
     square = jnp.sum(power[:, :, None] * power[None, :, :], axis=1)
-    return square / jnp.trace(square)
+    fourth = jnp.sum(square[:, :, None] * square[None, :, :], axis=1)
+    return fourth / jnp.sum(square * square)  # it is symmetric
 
 
 @jax.jit

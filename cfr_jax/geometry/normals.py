@@ -33,8 +33,7 @@ def estimate_normals(
     offset = points[neighbors] - points[:, None]
     square = jnp.sum(offset * offset, axis=-1)
     reach = _REACH**2 * jnp.mean(square, axis=1, keepdims=True)
-    spread = reach > 0
-    weight = jnp.exp(jnp.where(spread, square / jnp.where(spread, -2 * reach, 1), 0))
+    weight = jnp.exp(square / jnp.where(reach > 0, -2 * reach, 1))
     # the point itself belongs to its neighborhood, with offset zero and weight one
     weight = weight / (1 + jnp.sum(weight, axis=1, keepdims=True))
     mean = jnp.sum(weight[..., None] * offset, axis=1)

@@ -37,7 +37,7 @@ class Frames:
     scale: float
     initial: Float[np.ndarray, "4 4"]
     """Applied to the caller's source before it is centered."""
-    size_ratio: float = 1.0
+    size_ratio: float
     """Radius of the source divided by the radius of the target."""
 
     def to_caller(self, transforms: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
@@ -67,10 +67,13 @@ class UnitCloud:
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"] | None
-    neighbors: Int[np.ndarray, "n k"]
+    neighbors: Int[np.ndarray, "n k"] | None
+    """None where the device is to find them."""
     mask: Bool[np.ndarray, " n"]
     rows: Int[np.ndarray, " used"]
     """Indices of the used points among the caller's, in order. The padding follows the points."""
+    neighbor_count: int
+    """How many neighbors each point has."""
 
 
 def unit_frames(
@@ -112,10 +115,12 @@ def to_unit(
     neighbors: int,
     radius: float,
     seed: int,
+    search: bool = True,
 ) -> UnitCloud:
-    """At most `budget` points of `cloud`, moved, centered and scaled, with neighbors and padding.
+    """At most `budget` points of `cloud`, moved, centered, scaled and padded.
 
-    Stray points, more than four radii from the median, are left out.
+    Stray points, more than four radii from the median, are left out. The neighbors are found here,
+    unless `search` is false: an accelerator finds them faster.
     """
     points = (motions.apply(motion, cloud.points) - center) / scale
     near = np.linalg.norm(points - np.median(points, axis=0), axis=1) <= _STRAY
@@ -124,13 +129,14 @@ def to_unit(
     used = points[rows].astype(np.float32)
     count = len(used)
     size = bucket(count) if count > neighbors else count
-    found = nearest_on_host(used, min(neighbors, count - 1), radius=radius)
+    k = min(neighbors, count - 1)
     pad = ((0, size - count), (0, 0))
+    found = np.pad(nearest_on_host(used, k, radius=radius), pad) if search else None
     normals = None
     if cloud.normals is not None:
         normals = motions.rotate(motion, cloud.normals[rows]).astype(np.float32)
         normals = np.pad(normals, pad)
-    return UnitCloud(np.pad(used, pad), normals, np.pad(found, pad), np.arange(size) < count, rows)
+    return UnitCloud(np.pad(used, pad), normals, found, np.arange(size) < count, rows, k)
 
 
 def thinned(unit: UnitCloud, *, budget: int, neighbors: int, radius: float, seed: int) -> UnitCloud:
@@ -146,6 +152,7 @@ def thinned(unit: UnitCloud, *, budget: int, neighbors: int, radius: float, seed
         neighbors=neighbors,
         radius=radius,
         seed=seed,
+        search=unit.neighbors is not None,
     )
 
 

@@ -1,30 +1,26 @@
-"""Reading and writing of point clouds, and what users call a point cloud made into one.
+"""Reading and writing of point clouds, and whatever users have as a point cloud made into one.
 
 Names load on first use: help texts list the formats (`cfr_jax.io.formats`) without numpy.
 """
 
 from typing import TYPE_CHECKING
 
-__all__ = ["CloudFileError", "PointCloud", "as_point_cloud", "read", "write"]
+__all__ = ["CloudFileError", "CloudWarning", "PointCloud", "as_point_cloud", "read", "write"]
 
 if TYPE_CHECKING:
-    from cfr_jax.io.cloud import CloudFileError, PointCloud
+    from cfr_jax.io.cloud import CloudFileError, CloudWarning, PointCloud
     from cfr_jax.io.coercion import as_point_cloud
     from cfr_jax.io.files import read, write
 else:
+    from cfr_jax.runtime.lazy import loader
+
     _HOMES = {
         "CloudFileError": "cloud",
+        "CloudWarning": "cloud",
         "PointCloud": "cloud",
         "as_point_cloud": "coercion",
         "read": "files",
         "write": "files",
     }
 
-    def __getattr__(name):
-        if name not in _HOMES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        import importlib
-
-        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-        globals()[name] = value
-        return value
+    __getattr__ = loader(__name__, _HOMES)

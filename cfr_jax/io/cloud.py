@@ -1,13 +1,17 @@
-"""The one form in which points come in from outside: checked, float64, on the host."""
+"""The form that all points from outside take: checked, float64, on the host."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64, Real
 
 from cfr_jax.runtime.words import Refused
+
+if TYPE_CHECKING:
+    from cfr_jax.io.table import Table
 
 # No unit of length makes a larger number a scan (the Earth is 6.4e9 mm from its center), and
 # float64 still resolves 1e-4 there. Flipped bits and missing-value marks (1e30) lie beyond.
@@ -19,6 +23,18 @@ UNIT_TOLERANCE = 0.02
 
 class CloudFileError(Refused):
     """A file could not be read or written; says which file, where in it, and what was wanted."""
+
+
+class CloudWarning(UserWarning):
+    """Something was read by a rule because the file does not say it, or left out on writing.
+
+    `about` is the file or the argument, `note` is what happened to it.
+    """
+
+    def __init__(self, about: object, note: str) -> None:
+        super().__init__(f"{about}: {note}")
+        self.about: str = str(about)
+        self.note: str = note
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +49,11 @@ class PointCloud:
         points: (n, 3) float64, n >= 1, in the unit and the frame they came in.
         normals: (n, 3) float64 of length one, or None.
         name: what to call the cloud in messages and pictures: for a file, its name.
-        left_out: rows left out on reading because they carry no point, which organized PCD
-            clouds mark by NaN.
+        left_out: how many rows of the file were left out because their x, y or z is NaN or
+            infinite, which marks cells without a point.
+        notes: sentences about what was read by a rule because the file does not say it.
+        table: all columns of the file, if `read` was asked for its properties; else None.
+            `write` then writes the table, not only points and normals.
     """
 
     # Plain arrays: construction takes any numbers, and answers a wrong shape itself.
@@ -42,6 +61,8 @@ class PointCloud:
     normals: np.ndarray | None = None
     name: str = "cloud"
     left_out: int = 0
+    notes: tuple[str, ...] = ()
+    table: Table | None = None
 
     def __post_init__(self) -> None:
         points = checked_points(self.points)
@@ -97,52 +118,9 @@ def unit_normals(normals: np.ndarray, count: int) -> Float64[np.ndarray, "n 3"]:
 def usable_normals(normals: Real[np.ndarray, "n 3"]) -> Real[np.ndarray, "n 3"] | None:
     """The normals of a file, or None if one of them is zero or not finite.
 
-    Programs write such rows where they could not estimate a normal. A cloud has normals
-    everywhere or not at all: whoever needs them estimates them for all points alike.
+    Programs write such rows where they could not estimate a normal. A cloud has normals for all
+    points or for none: whoever needs them estimates them for all points alike.
     """
     low, high = normals.min(axis=1), normals.max(axis=1)
     whole = np.isfinite(low) & np.isfinite(high) & ((low < 0) | (high > 0))
     return normals if whole.all() else None
-
-
-def cloud_of_filled(points: np.ndarray, normals: np.ndarray | None, name: str) -> PointCloud:
-    """The rows of an organized cloud that hold a point, with their normals if all are usable.
-
-    Rows with a NaN in x, y or z are cells without a point: left out, and counted in `left_out`.
-    Raises ValueError where no row is left.
-    """
-    filled = ~np.isnan(points).any(axis=1)
-    left_out = len(points) - int(np.count_nonzero(filled))
-    if left_out and left_out == len(points):
-        raise ValueError(f"all {left_out} points are NaN, wanted at least one that is not")
-    if left_out:
-        points, normals = points[filled], None if normals is None else normals[filled]
-    usable = None if normals is None or not len(points) else usable_normals(normals)
-    return PointCloud(points, usable, name, left_out)
-
-
-# More numbers than this to a point are not seen; three long rows are a cloud on its side.
-_MOST_COLUMNS = 64
-
-
-def cloud_from_table(table: np.ndarray, name: str) -> PointCloud:
-    """A cloud from rows of x, y, z and perhaps more.
-
-    Of exactly six columns the last three are normals if all of them are of about unit length;
-    otherwise they are colors or the like, and left out as every other column is.
-    """
-    if table.ndim != 2 or table.shape[1] < 3:
-        raise ValueError(f"wanted rows of x, y, z and perhaps more, got the shape {table.shape}")
-    if len(table) <= 6 and table.shape[1] > _MOST_COLUMNS:
-        raise ValueError(
-            f"got the shape {table.shape}, wanted a row for each point: is it transposed (.T)?"
-        )
-    normals = None
-    if table.shape[1] == 6 and len(table):
-        candidate = as_float64(table[:, 3:])
-        with np.errstate(over="ignore"):
-            squares = np.einsum("ij,ij->i", candidate, candidate)
-        # NaN compares false: rows that are no numbers are no normals.
-        if np.all(np.abs(squares - 1.0) <= 2.0 * UNIT_TOLERANCE):
-            normals = candidate
-    return PointCloud(table[:, :3], normals, name)

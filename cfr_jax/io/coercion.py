@@ -7,29 +7,38 @@ so that none of them is imported here.
 from __future__ import annotations
 
 import os
+import warnings
 from typing import Any
 
 import numpy as np
 
-from cfr_jax.io.cloud import CloudFileError, PointCloud, usable_normals
+from cfr_jax.io.cloud import (
+    CloudFileError,
+    CloudWarning,
+    PointCloud,
+    as_float64,
+    usable_normals,
+)
 from cfr_jax.io.columns import from_data_frame, from_point_cloud2, from_structured, is_point_cloud2
 from cfr_jax.io.files import read
 from cfr_jax.io.mesh import Mesh
+from cfr_jax.io.unnamed import along_axes, are_unit
 
 
 def as_point_cloud(obj: Any, *, name: str, samples: int | None = None, seed: int = 0) -> PointCloud:
     """Points on the host, float64, from what a caller has at hand.
 
     Args:
-        obj: an array (n, 3), or (n, 6) with normals of any length in the last three columns, of
-            floats or integers: from numpy, jax, torch (on any device, with or without gradients),
-            whatever speaks DLPack or the array protocol, or nested lists; a structured array with
-            the fields x, y, z, and perhaps normal_x … or nx …; a pandas or polars frame with such
-            columns, or with 3 or 6 of them; a ROS PointCloud2 message, whose cells without a point
-            (NaN) are left out; an Open3D point cloud or triangle mesh (legacy or tensor); a
-            trimesh PointCloud, Trimesh or Scene; a path, which is read; or a PointCloud.
-        name: what the caller calls this argument; it opens every error message, and names the
-            cloud unless a file does.
+        obj: an array (n, 3), or (n, 6) with unit normals in the last three columns, of floats or
+            integers: from numpy, jax, torch (on any device, with or without gradients), whatever
+            speaks DLPack or the array protocol, or nested lists; a structured array with the fields
+            x, y, z, and perhaps normal_x … or nx …; a pandas or polars frame with such columns, or
+            with 3 or 6 of them; a ROS PointCloud2 message, whose cells without a point (NaN) are
+            left out; an Open3D point cloud or triangle mesh (legacy or tensor); a trimesh
+            PointCloud, Trimesh or Scene; a path, which is read; or a PointCloud. If the last three
+            of six columns are not unit vectors, they are left out with a `CloudWarning`.
+        name: what the caller calls this argument; every error message begins with it, and it names
+            the cloud unless a file does.
         samples: as for `read`: points drawn from a mesh, 10,000 if None, 0 for its vertices.
         seed: of that sampling.
 
@@ -140,14 +149,31 @@ def _checked(obj: Any, array: np.ndarray) -> np.ndarray:
 
 def _from_array(array: np.ndarray, name: str) -> PointCloud:
     shape = array.shape
-    if array.ndim == 2 and shape[1] in (3, 6):
-        return PointCloud(array[:, :3], array[:, 3:] if shape[1] == 6 else None, name)
+    if array.ndim == 2 and shape[1] == 3:
+        return PointCloud(array, None, name)
+    if array.ndim == 2 and shape[1] == 6:
+        points, last = array[:, :3], array[:, 3:]
+        if _are_normals(last):
+            return PointCloud(points, last, name)
+        warnings.warn(CloudWarning(name, _NO_NORMALS), stacklevel=4)
+        return PointCloud(points, None, name)
     hint = ""
     if array.ndim == 2 and shape[0] in (3, 6):
         hint = "; did you mean .T?"
     elif array.ndim == 3 and shape[0] == 1 and shape[2] in (3, 6):
         hint = "; did you mean [0]?"
     raise ValueError(f"got the shape {shape}, wanted (n, 3), or (n, 6) with normals{hint}")
+
+
+_NO_NORMALS = (
+    "the last three of six columns are no unit normals (colors?) and were left out; "
+    "PointCloud(points, normals) takes any directions"
+)
+
+
+def _are_normals(columns: np.ndarray) -> bool:
+    parts = [as_float64(columns[:, k]) for k in range(3)]
+    return are_unit(parts) and not along_axes(parts)
 
 
 def _kind(obj: Any) -> str:

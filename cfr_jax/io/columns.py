@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 
-from cfr_jax.io.cloud import PointCloud, cloud_of_filled, usable_normals
+from cfr_jax.io.cloud import PointCloud, usable_normals
+from cfr_jax.io.naming import are_names
+from cfr_jax.io.table import cloud_of_filled, table_of
 
 # sensor_msgs/PointField: the numbers of the types.
 _ROS_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_POINT = ("x", "y", "z")
-_NORMALS = (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
+_READ = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "nx", "ny", "nz")
 
 
 def is_point_cloud2(obj: Any) -> bool:
@@ -30,7 +30,7 @@ def from_point_cloud2(message: Any, name: str) -> PointCloud:
     order = ">" if message.is_bigendian else "<"
     names, formats, offsets = [], [], []
     for field in message.fields:
-        if field.name in _POINT or field.name in sum(_NORMALS, ()):
+        if field.name in _READ:
             if field.datatype not in _ROS_TYPES or field.count not in (0, 1):
                 raise ValueError(
                     f"field {field.name!r} has the type {field.datatype} and the count "
@@ -60,45 +60,31 @@ def from_point_cloud2(message: Any, name: str) -> PointCloud:
 
 
 def from_structured(array: np.ndarray, name: str) -> PointCloud:
-    """Fields x, y, z of a structured array of any shape, and normals if they are there.
+    """The fields x, y, z of a structured array of any shape, and the normals if they are there.
 
-    Rows with a NaN in x, y or z carry no point, as ROS marks them: they are left out and counted
-    in `left_out`.
+    Rows with NaN in x, y or z carry no point, as ROS marks them: they are left out and counted in
+    `left_out`.
     """
     flat = array.reshape(-1)
-    points, normals = _columns(array.dtype.names, lambda column: flat[column])
-    return cloud_of_filled(points, normals, name)
+    names = list(array.dtype.names or ())
+    table = table_of(names, [flat[column] for column in names])
+    return cloud_of_filled(table.points(), table.normals(), name)
 
 
 def from_data_frame(frame: Any, name: str) -> PointCloud | None:
-    """Columns x, y, z (in any case) of a pandas or polars frame, and normals if they are there;
-    None for a frame without such columns."""
-    names = {str(column).lower(): column for column in frame.columns}
-    if not set(_POINT) <= names.keys():
+    """The columns x, y, z of a pandas or polars frame, and the normals if they are there; None for
+    a frame without such columns."""
+    names = [str(column) for column in frame.columns]
+    if not are_names(names):
         return None
-    points, normals = _columns(names, lambda column: _numbers(frame[names[column]].to_numpy()))
-    return PointCloud(points, None if normals is None else usable_normals(normals), name)
+    values = [frame[column].to_numpy() for column in frame.columns]
+    table = table_of(names, values)
+    for column in (*table.roles.points, *table.roles.normals):
+        _check_numbers(values[column])
+    normals = table.normals()
+    return PointCloud(table.points(), None if normals is None else usable_normals(normals), name)
 
 
-def _columns(
-    names: Iterable[str] | None, column: Callable[[str], np.ndarray]
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points (n, 3), and normals (n, 3) or None, from the columns of these names."""
-    names = set(names or ())
-    missing = [axis for axis in _POINT if axis not in names]
-    if missing:
-        raise ValueError(
-            f"has no {' and no '.join(missing)} among {', '.join(sorted(names)) or 'no columns'}"
-        )
-    normals = next((triple for triple in _NORMALS if set(triple) <= names), None)
-
-    def stacked(triple: Iterable[str]) -> np.ndarray:
-        return np.stack([np.asarray(column(axis), np.float64) for axis in triple], axis=1)
-
-    return stacked(_POINT), None if normals is None else stacked(normals)
-
-
-def _numbers(values: np.ndarray) -> np.ndarray:
+def _check_numbers(values: np.ndarray) -> None:
     if values.dtype.kind not in "fiu":
         raise ValueError(f"a column is of {values.dtype}, wanted floats or integers")
-    return values

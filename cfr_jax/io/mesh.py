@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64, Int64, Real
 
 from cfr_jax.io.cloud import PointCloud, checked_points, usable_normals
 
+if TYPE_CHECKING:
+    from cfr_jax.io.table import Table
+
 DEFAULT_SAMPLES = 10_000
+_AT_ONCE = 1 << 16  # triangles, so that memory stays near what the mesh itself takes
+# All corners one after the other, where each polygon starts among them, and how many it has.
+Polygons = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,12 +27,14 @@ class Mesh:
     triangles: Int64[np.ndarray, "t 3"]
     name: str
     normals: Real[np.ndarray, "v 3"] | None = None
+    notes: tuple[str, ...] = ()
+    table: Table | None = None
 
     def points(self, samples: int | None, seed: int) -> PointCloud:
         """The surface as `samples` points, 10,000 if None; the bare vertices if 0."""
         if samples == 0:
             normals = None if self.normals is None else usable_normals(self.normals)
-            return PointCloud(self.vertices, normals, self.name)
+            return PointCloud(self.vertices, normals, self.name, notes=self.notes, table=self.table)
         if len(self.triangles) == 0:
             raise ValueError(
                 f"is a mesh without faces ({len(self.vertices)} vertices), wanted at least one "
@@ -44,8 +53,16 @@ class Mesh:
                 f"wanted 0 to {len(vertices) - 1}"
             )
         generator = np.random.default_rng(seed)
-        points, normals = sample_triangles(vertices[self.triangles], count, generator)
-        return PointCloud(points, normals, self.name)
+        areas = np.concatenate(
+            [
+                areas_and_normals(vertices[self.triangles[start : start + _AT_ONCE]])[0]
+                for start in range(0, len(self.triangles), _AT_ONCE)
+            ]
+        )
+        chosen = _chosen_by_area(areas, count, generator)
+        corners = vertices[self.triangles[chosen]]
+        points, normals = _points_within(corners, generator), areas_and_normals(corners)[1]
+        return PointCloud(points, normals, self.name, notes=self.notes, table=self.table)
 
 
 def sample_triangles(
@@ -55,18 +72,32 @@ def sample_triangles(
 
     Raises ValueError where no triangle has an area.
     """
-    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     areas, normals = areas_and_normals(corners)
+    chosen = _chosen_by_area(areas, count, rng)
+    return _points_within(corners[chosen], rng), normals[chosen]
+
+
+def _chosen_by_area(
+    areas: Float64[np.ndarray, " t"], count: int, rng: np.random.Generator
+) -> Int64[np.ndarray, " n"]:
+    """Triangles drawn as often as their area is large."""
     cumulative = np.cumsum(areas)
     if not cumulative[-1] > 0:
-        raise ValueError(f"all {len(corners)} triangles have no area, wanted a surface")
+        raise ValueError(f"all {len(areas)} triangles have no area, wanted a surface")
     # side="right" never picks a triangle of zero area: its bound equals the one before
     draw = rng.uniform(0.0, cumulative[-1], count)
-    chosen = np.searchsorted(cumulative, draw, side="right")
+    return np.searchsorted(cumulative, draw, side="right")
+
+
+def _points_within(
+    corners: Float64[np.ndarray, "n 3 3"], rng: np.random.Generator
+) -> Float64[np.ndarray, "n 3"]:
+    """A point of each triangle, uniform over it."""
+    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     # The square root spreads evenly over a triangle what is drawn along its height.
+    count = len(corners)
     along, across = np.sqrt(rng.uniform(size=(count, 1))), rng.uniform(size=(count, 1))
-    points = a[chosen] + along * ((1 - across) * ab[chosen] + across * ac[chosen])
-    return points, normals[chosen]
+    return a + along * ((1 - across) * ab + across * ac)
 
 
 def areas_and_normals(
@@ -87,13 +118,22 @@ def fan_triangles(
     corners enclose nothing and give no triangle.
     """
     counts = np.maximum(sizes - 2, 0)
-    firsts = np.repeat(starts, counts)
-    # The running number of a triangle within its polygon.
-    within = np.arange(len(firsts)) - np.repeat(np.cumsum(counts) - counts, counts)
-    corners = values[firsts[:, None] + np.stack([0 * within, within + 1, within + 2], axis=1)]
-    # Text may hold anything; beyond 2^53 a float64 is no index, and NaN compares false.
-    whole = ((np.abs(corners) < 2**53) & (corners % 1 == 0)).all(axis=1)
-    if not whole.all():
-        row = int(np.argmin(whole))
-        raise ValueError(f"triangle {row} names vertices {corners[row]}, wanted integers")
-    return corners.astype(np.int64)
+    ends = np.cumsum(counts)
+    total = int(ends[-1]) if len(ends) else 0
+    triangles = np.empty((total, 3), np.int64)
+    for start in range(0, total, _AT_ONCE):
+        rows = np.arange(start, min(start + _AT_ONCE, total))
+        polygon = np.searchsorted(ends, rows, side="right")
+        # The running number of a triangle within its polygon.
+        within = rows - (ends[polygon] - counts[polygon])
+        firsts = starts[polygon][:, None]
+        corners = values[firsts + np.stack([0 * within, within + 1, within + 2], axis=1)]
+        # Text may hold anything; beyond 2^53 a float64 is no index, and NaN compares false.
+        whole = ((np.abs(corners) < 2**53) & (corners % 1 == 0)).all(axis=1)
+        if not whole.all():
+            row = int(np.argmin(whole))
+            raise ValueError(
+                f"triangle {start + row} names vertices {corners[row]}, wanted integers"
+            )
+        triangles[start : start + len(rows)] = corners
+    return triangles

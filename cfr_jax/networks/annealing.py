@@ -1,6 +1,6 @@
-"""The annealing net, which CFR and RPM-Net share: how sharp the match of an iteration is.
+"""The annealing network, which CFR and RPM-Net share: it decides how sharp each match is.
 
-Shapes below: n, m points of a cloud, L iterations.
+Shapes below: n, m points of the clouds, L iterations.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from cfr_jax.networks.layers import GROUPS, apply_layer, kernel_init, layer_of
 from cfr_jax.networks.pooling import pooled_layer
 
-# What the authors of both call its layers; what weight and bias of each are called here.
+# The name of each layer in both authors' checkpoints, and of its weight and bias here.
 AUTHORS_LAYERS = (
     ("weights_net.prepool.0", "annealing/point_0_dense/kernel", "annealing/point_0_dense/bias"),
     ("weights_net.prepool.1", "annealing/point_0_scale", "annealing/point_0_shift"),
@@ -35,7 +35,8 @@ AUTHORS_LAYERS = (
 
 
 class Annealing(NamedTuple):
-    """How sharp (beta) and how far-reaching (alpha) the match of each iteration is."""
+    """The annealing parameters: per iteration, how sharp (beta) and how far-reaching (alpha) the
+    match is."""
 
     beta: Float[Array, " L"]
     alpha: Float[Array, " L"]

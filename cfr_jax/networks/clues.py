@@ -1,7 +1,7 @@
-"""What a network alone tells of its answer, and how probable that makes it.
+"""Clues from the network alone about its answer, and the probability that the answer is right.
 
 Right means within 5 degrees and a tenth of the unit sphere's radius. The probability is a logistic
-regression on the clues, whose coefficients come with the weights (`networks.probability`).
+regression on the clues; its coefficients come with the weights (`networks.probability`).
 """
 
 from __future__ import annotations
@@ -19,24 +19,25 @@ _HIGHEST = lax.Precision.HIGHEST
 
 @struct.dataclass
 class NetworkClues:
-    """What the network alone knows of its answer; each is a number of order one."""
+    """What the network alone knows about its answer; each clue is of order one."""
 
     source_found: Float[Array, ""]
     """Mean correspondence weight of the source."""
     target_found: Float[Array, ""]
+    """Mean correspondence weight of the target."""
     settled: Float[Array, ""]
-    """How far the last iteration still turned: log of degrees + 0.1."""
+    """How far the last iteration still rotated: log of degrees + 0.1."""
     settling: Float[Array, ""]
-    """The same of the iteration before."""
+    """The same for the iteration before."""
     residual: Float[Array, ""]
-    """How far the matched places lie from where the answer puts the points: log of the weighted
-    root mean square + 0.01."""
+    """Distance between the matched positions and where the answer puts the points: log of the
+    weighted root mean square + 0.01."""
     sharpness: Float[Array, ""]
-    """Log of how far the matched places spread, over how far their points do: where a match is
-    undecided among many points, it points to the middle of them."""
+    """Log of the spread of the matched positions over the spread of their points. If a match is
+    undecided among many points, its position is their middle, and the spread shrinks."""
     lever: Float[Array, ""]
-    """Log of the spread about the axis that holds a rotation the least: the conditioning of the
-    fit."""
+    """Log of the spread about the axis around which the rotation is held the least: the
+    conditioning of the fit."""
 
 
 def of_network(
@@ -48,17 +49,20 @@ def of_network(
     source_mask: Bool[Array, " n"] | None = None,
     target_mask: Bool[Array, " m"] | None = None,
 ) -> NetworkClues:
-    """The clues of the iterations' `transforms` and of the last match: where it put the points of
-    the source (`targets`), and how much of each point of both clouds it found."""
+    """The clues from the `transforms` of all iterations and from the last match.
+
+    `targets` is where the match puts the points of the source; `weights` and `covered` are how much
+    of each source and target point found a partner.
+    """
     share = weights / (jnp.sum(weights) + 1e-5)
     away = rigid.apply(transforms[-1], source) - targets
     square = jnp.sum(share * jnp.sum(away * away, axis=1))
     places, points = (_spread(cloud, share) for cloud in (targets, source))
     spread, before_it = jnp.trace(places), jnp.trace(points)
-    # the sum of the two smaller eigenvalues, nearly, and exactly on a line
+    # nearly the sum of the two smaller eigenvalues; exactly so for points on a line
     twice = spread * spread - jnp.sum(places * places)
     lever = twice / (2 * spread + 1e-4)
-    # a single iteration has none before it, and counts as settled
+    # a single iteration has no predecessor, and counts as settled
     earlier, before, last = (transforms[max(len(transforms) - back, 0)] for back in (3, 2, 1))
     return NetworkClues(
         source_found=_mean(weights, source_mask),
@@ -72,7 +76,7 @@ def of_network(
 
 
 def of_registration(fitted: Calibration | None, clues: NetworkClues) -> Float[Array, ""] | None:
-    """Probability in [0, 1] that the network's own answer is right; None without calibration."""
+    """Probability in [0, 1] that the network's own answer is right; None without a calibration."""
     if fitted is None:
         return None
     sure = logit(fitted.register, vars(clues))
@@ -87,14 +91,17 @@ def _mean(values: Array, mask: Array | None) -> Array:
 
 
 def turned(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Float[Array, ""]:
-    """Log of degrees + 0.1; its slope is bounded where motions are equal or half a turn apart."""
+    """Log of the angle between two rotations in degrees + 0.1.
+
+    Its slope stays bounded if the rotations are equal or half a turn apart.
+    """
     chord = jnp.sum((first[:3, :3] - second[:3, :3]) ** 2)
     half_sine = jnp.minimum(jnp.sqrt(chord / 8 + 1e-12), 1 - 1e-6)
     return jnp.log(jnp.rad2deg(2 * jnp.arcsin(half_sine)) + 0.1)
 
 
 def _spread(points: Array, share: Array) -> Array:
-    """Covariance of weighted points."""
+    """Weighted covariance of points."""
     center = jnp.matmul(share, points, precision=_HIGHEST)
     offset = points - center
     return jnp.matmul(offset.T, share[:, None] * offset, precision=_HIGHEST)

@@ -1,9 +1,9 @@
-"""Raw channels of a point and its neighbors, before anything is learned.
+"""The raw channels of a point and its neighbors, which the learned layers start from.
 
-The point-pair feature (Drost et al., 2010) of a point p with normal n and a neighbor q with normal
-m, d = q - p: how d lies to both normals, how the normals lie to each other, and |d|. It does not
-change under rigid motions. Two forms: "dot" (CFR) takes inner products of unit vectors, "angle"
-(RPM-Net) their angles.
+The point-pair feature (Drost et al., 2010) describes a point p with normal n and a neighbor q with
+normal m. With d = q - p, it holds how d relates to each normal, how the normals relate to each
+other, and |d|. It does not change under rigid motions. There are two forms: "dot" (CFR) takes inner
+products of unit vectors, "angle" (RPM-Net) takes their angles.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def raw_features(
 ) -> Float[Array, "n k c"]:
     """Seven channels: the offset to the neighbor (3), then the point-pair feature (4).
 
-    With `position` the point's own coordinates come first, ten channels in all, as in RPM-Net.
+    With `position`, the point's own coordinates come first: ten channels in all, as in RPM-Net.
     """
     offset = points[neighbors] - points[:, None]
     channels = [offset, pair_feature(offset, normals[:, None], normals[neighbors], ppf=ppf)]
@@ -44,7 +44,8 @@ def pair_feature(
 ) -> Float[Array, "n k 4"]:
     """Channels (n, d), (m, d), (n, m), |d|, where (a, b) is a dot product or an angle in radians.
 
-    Finite gradients everywhere: where d or a cross product is zero, the derivative used is zero.
+    Gradients are finite everywhere: where d or a cross product is zero, zero is used instead.
+    Raises ValueError for an unknown form.
     """
     length = safe_norm(offset)
     if ppf == "dot":
@@ -67,7 +68,7 @@ def pair_feature(
 
 
 def safe_norm(vectors: Float[Array, "*rows c"]) -> Float[Array, "*rows"]:
-    """Euclidean length along the last axis, its gradient zero instead of NaN at zero."""
+    """Euclidean length along the last axis; at zero the gradient is zero instead of NaN."""
     square = jnp.sum(vectors * vectors, axis=-1)
     positive = square > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)

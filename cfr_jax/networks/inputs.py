@@ -1,4 +1,4 @@
-"""A cloud as the network takes it, with normals and neighbors, and the settings of both."""
+"""The input of a network: clouds with normals and neighbors, and the settings."""
 
 from __future__ import annotations
 
@@ -22,35 +22,35 @@ from cfr_jax.networks.sinkhorn import Form
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What changes the compiled program. The defaults are the paper's."""
+    """Settings that change the compiled program. The defaults are the paper's."""
 
     neighbors: int = 64
     radius: float = 0.3
-    """Neighbors further away are replaced by the nearest one; in units of the unit sphere."""
+    """Neighbors farther away are replaced by the nearest one; in radii of the unit sphere."""
     ppf: PairFeature = "dot"
     match: Form = "auto"
-    """How correspondences are found: "dense" stores the N x M affinities, "streamed" makes them
-    anew whenever it needs them, "fused" does so inside a GPU's kernel, "auto" streams what is large
-    for the platform. "log space" is RPM-Net's."""
+    """How correspondences are found. "dense" stores the N x M affinities, "streamed" recomputes
+    them whenever they are needed. "auto" streams clouds that are large for the platform. "log
+    space" is RPM-Net's form."""
     detach_motion: bool = False
-    """Stop gradients at the motion between iterations, as the paper trains."""
+    """Stop gradients at the motion between iterations, as in the paper's training."""
     activations: Activations = "float32"
-    """Of the heavy extraction: "bfloat16" halves its memory traffic, for training on accelerators.
-    """
-    # What the paper leaves out of RPM-Net, to measure what that saves. Weights answer best with
-    # what they were trained with.
+    """Type of the activations in the heavy extraction. "bfloat16" halves its memory traffic, for
+    training on accelerators."""
+    # The steps of RPM-Net that the paper removes, to measure what that saves. Weights work best
+    # with the settings they were trained with.
     passes: int | None = None
-    """Sinkhorn passes of every iteration; None: i passes in iteration i."""
+    """Sinkhorn passes in every iteration; None: i passes in iteration i."""
     repeat_annealing: bool = False
-    """Predict the annealing in every iteration, from where the source is by then."""
+    """Predict the annealing again in every iteration, from the current position of the source."""
     repeat_extraction: bool = False
-    """Extract the heavy features in every iteration, from the source as it is turned by then,
-    instead of handing on those of the iteration before."""
+    """Extract the heavy features again in every iteration, from the source as it lies by then,
+    instead of passing on the features of the iteration before."""
 
 
 @struct.dataclass
 class Cloud:
-    """A cloud ready for the network: normals and neighbors known; `mask` marks valid rows."""
+    """A cloud ready for the network, with normals and neighbors; `mask` marks the valid rows."""
 
     points: Float[Array, "n 3"]
     normals: Float[Array, "n 3"]
@@ -69,8 +69,7 @@ def prepare(
     """A `Cloud` from raw points (n, 3), or points and normals (n, 6).
 
     Missing normals are estimated (`normals.estimate_normals`); missing neighbors are searched on
-    the device. Fewer than K + 1 points have fewer neighbors each. Raises ValueError on wrong
-    shapes.
+    the device. With n <= K points, each has n - 1 neighbors. Raises ValueError for wrong shapes.
     """
     check_points("points", points)
     n = points.shape[0]
@@ -94,13 +93,13 @@ def prepare(
 
 
 def moved_by(motion: Float[Array, "4 4"], cloud: Cloud) -> Cloud:
-    """The cloud elsewhere: points moved, normals turned."""
+    """The cloud after a motion: points moved, normals rotated."""
     points, normals = rigid.apply(motion, cloud.points), rigid.rotate(motion, cloud.normals)
     return Cloud(points, normals, cloud.neighbors, cloud.mask)
 
 
 def check_points(name: str, points: Array | np.ndarray) -> None:
-    """Raises ValueError, naming the argument, where its shape is not that of a cloud."""
+    """Raises a ValueError that names the argument if its shape is not that of a cloud."""
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise ValueError(
             f"{name}: got shape {points.shape}, wanted (n, 3) points or (n, 6) points and normals"

@@ -1,12 +1,13 @@
-"""Linear, then GroupNorm: the layer that everything learned here is made of, by its statistics.
+"""Linear, then GroupNorm: the layer that all networks here are made of.
 
-GroupNorm (Wu & He, 2018) over all rows of one cloud: each group of channels is brought to mean zero
-and variance one. Flax's own takes the first axis for a batch and knows no mask.
+GroupNorm (Wu & He, 2018) runs over all rows of one cloud: each group of channels is normalized to
+mean zero and variance one. Flax's GroupNorm does not fit: it treats the first axis as a batch and
+has no mask over rows.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -14,14 +15,14 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 EPSILON = 1e-5
-GROUPS = 8  # of the channels, in most layers of the published networks
+GROUPS = 8  # groups of channels in most layers of the published networks
 
-# What PyTorch's Linear starts from, as the published networks did.
-kernel_init = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+# How PyTorch's Linear is initialized, and with it the published networks.
+kernel_init: Final = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 
 
 class Layer(NamedTuple):
-    """Parameters of a Linear and the GroupNorm behind it; every leaf may carry gradients."""
+    """Parameters of a Linear and of the GroupNorm after it; every leaf may carry gradients."""
 
     kernel: Float[Array, "i o"]
     bias: Float[Array, " o"]
@@ -44,9 +45,9 @@ def group_norm(
     groups: int,
     mask: Bool[Array, " n"] | None = None,
 ) -> Float[Array, "n c"]:
-    """GroupNorm of one cloud; rows where `mask` is false enter no statistic."""
-    # over the rows first, channel by channel, and then over the channels of a group: vectors as
-    # wide as x instead of as narrow as a group
+    """GroupNorm of one cloud; rows where `mask` is false do not affect the statistics."""
+    # Sum over the rows first, channel by channel, then over the channels of a group: this works on
+    # vectors as wide as x instead of as narrow as a group.
     size = x.shape[1] // groups
     valid = None if mask is None else mask[:, None].astype(x.dtype)
     count = jnp.asarray(x.shape[0], x.dtype) if valid is None else jnp.maximum(jnp.sum(valid), 1)
@@ -73,7 +74,7 @@ def apply_layer(
 
 
 def norm_of(mean: Float[Array, " o"], variance: Float[Array, " o"], groups: int) -> Norm:
-    """Channel moments joined into group statistics, spread over the channels again."""
+    """The norm from each channel's mean and variance, which are pooled over each group."""
     means = mean.reshape(groups, -1)
     joined = means.mean(1, keepdims=True)
     spread = ((means - joined) ** 2).mean(1) + variance.reshape(groups, -1).mean(1)
@@ -91,8 +92,11 @@ def fold(layer: Layer, norm: Norm) -> tuple[Float[Array, "i o"], Float[Array, " 
 def projections(
     layer: Layer, shift: Float[Array, " o"], scale: Float[Array, " o"], rows: Array, groups: int
 ) -> tuple[Float[Array, " o"], Float[Array, " o"]]:
-    """What a norm takes out of the gradient that comes into it: its mean over rows and channels of
-    the group, and its mean along the normalized values, from the gradients of shift and scale."""
+    """What a norm takes out of the incoming gradient, from the gradients of `shift` and `scale`.
+
+    First its mean over the rows and channels of the group, then its mean along the normalized
+    values. `rows` is the number of rows in the statistics.
+    """
     size = shift.size // groups
     flat, tilt = (
         jnp.repeat((layer.scale * s).reshape(groups, size).sum(1), size) / (rows * size)
@@ -102,7 +106,7 @@ def projections(
 
 
 def layer_of(module: nn.Module, name: str, inputs: int, width: int) -> Layer:
-    """The parameters of a Linear and its GroupNorm, as `name` in a module under construction."""
+    """Declares the parameters of a Linear and its GroupNorm in `module`, under `name`."""
     kernel, bias = _Linear(width, name=f"{name}_dense")(inputs)
     scale = module.param(f"{name}_scale", nn.initializers.ones, (width,))
     shift = module.param(f"{name}_shift", nn.initializers.zeros, (width,))
@@ -110,7 +114,7 @@ def layer_of(module: nn.Module, name: str, inputs: int, width: int) -> Layer:
 
 
 class _Linear(nn.Module):
-    """The parameters of a Dense, for those who apply them in their own way."""
+    """The parameters of a Dense layer, without applying them."""
 
     width: int
 

@@ -1,4 +1,4 @@
-"""What the parts of networks have in common when each is timed alone (figure 6 of the paper)."""
+"""What networks share when their parts are timed one by one (figure 6 of the paper)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cfr_jax.geometry import rigid
 from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.networks.sinkhorn import Affinity, Form, Match, match
 
-# What the parts are called, in the order in which figures show them.
+# The names of the parts, in the order of the figures.
 NEIGHBORS, FEATURES, ANNEALING = "neighbors", "features", "annealing"
 MATCHING, MOTION = "matching and Sinkhorn", "Procrustes"
 
@@ -24,7 +24,10 @@ def on_host(points: Float[np.ndarray, "n 3"], k: int, radius: float) -> Int[np.n
 
 
 def matching(form: Form) -> Callable[..., Match]:
-    """The match in this form: features of both clouds, beta, alpha, target points, passes."""
+    """A function that matches in this form.
+
+    It takes the features of source and target, beta, alpha, the target points, and the passes.
+    """
 
     def matched(source: Any, target: Any, beta: Any, alpha: Any, points: Any, passes: int) -> Match:
         return match(Affinity(source, target, beta, alpha), points, passes=passes, form=form)
@@ -34,5 +37,5 @@ def matching(form: Form) -> Callable[..., Match]:
 
 @jax.jit
 def move(points: Float[Array, "n 3"], found: Match) -> Float[Array, "n 3"]:
-    """The points, moved by the motion that a match asks for."""
+    """The points, moved by the rigid motion that fits the match."""
     return rigid.apply(rigid.fit_rigid(points, found.targets, found.weights), points)

@@ -1,10 +1,11 @@
-"""Linear, GroupNorm, ReLU and the maximum over all points, in one go: PointNet's wide last layer.
+"""Linear, GroupNorm, ReLU and the maximum over all points, in one step: PointNet's wide last layer.
 
-Of n rows of 1,024 channels only one row per channel survives the maximum. The norm's statistics
-follow from the mean and covariance of the narrow input, the norm and the ReLU are monotonic, so the
-maximum can be taken before them; and the gradient is one row per channel, plus what the norm takes
-out of it, which is linear in the input: a product as narrow as the input instead of one as wide as
-the output. What is as wide as the output is made for a tile of rows at a time.
+Of n rows of 1,024 channels, only one row per channel survives the maximum. The statistics of the
+norm follow from the mean and covariance of the narrow input. The norm and the ReLU are monotonic,
+so the maximum can be taken before them. The gradient is one row per channel, plus what the norm
+takes out of it. That part is linear in the input, so it needs a product as narrow as the input
+instead of one as wide as the output. Arrays as wide as the output exist only for one tile of rows
+at a time.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from jaxtyping import Array, Bool, Float
 
 from cfr_jax.networks.layers import Layer, Norm, norm_of, projections
 
-_HIGHEST = lax.Precision.HIGHEST  # for what becomes a variance
-# 64 MiB of 1,024 channels: clouds of the usual size are one tile. An accelerator takes more.
+_HIGHEST = lax.Precision.HIGHEST  # for products that become variances
+# Rows of a tile. On a CPU that is 64 MiB of 1,024 channels: clouds of the usual size are one tile.
 _ON_CPU, _ELSEWHERE = 1 << 14, 1 << 18
 
 _Residuals = tuple[Layer, Array, Array, tuple[Array, Array, Array], Norm, Array, Array]
@@ -34,9 +35,10 @@ def pooled_layer(
     on_cpu: int = _ON_CPU,
     elsewhere: int = _ELSEWHERE,
 ) -> Float[Array, " o"]:
-    """max over the valid rows of relu(groupnorm(x kernel + bias)), with a derivative of its own.
+    """The maximum over the valid rows of relu(groupnorm(x kernel + bias)).
 
-    What is as wide as the output is made for so many rows at a time, by platform.
+    The derivative has a rule of its own. Arrays as wide as the output have at most `on_cpu` rows on
+    a CPU and `elsewhere` rows on other platforms.
     """
     valid = jnp.ones(x.shape[0], x.dtype) if mask is None else mask.astype(x.dtype)
     return _pooled(layer, x, valid, groups, (on_cpu, elsewhere))
@@ -65,8 +67,10 @@ def _forward(
 
 
 def _highest(x: Array, kernel: Array, valid: Array, rows: tuple[int, int]) -> tuple[Array, Array]:
-    """Per channel the largest value of x kernel over the valid rows, and the first row that has it;
-    0 and some row where none is valid."""
+    """Per channel, the largest value of x kernel over the valid rows, and the first row with it.
+
+    If no row is valid, the value is 0 and the row is arbitrary.
+    """
     n = x.shape[0]
     if n <= min(rows):
         high, chosen = _of_tile(x, kernel, valid, 0, n - 1)

@@ -1,10 +1,10 @@
 """From clues to a probability: logistic regressions whose coefficients belong to the weights.
 
-A network trained on other data answers otherwise, so that what its clues are worth is measured for
-each set of weights (`evaluation.calibration`, `cfr calibrate`) and kept with them: as a note of
-their file, and in the parameters as `params["calibration"]`. There it is a part of the tree without
-leaves. Gradients, optimizers and `jax.tree.map` pass it by, a compiled program has its numbers
-inside, and networks do not look at it.
+Networks trained on different data give different answers, so the meaning of their clues is measured
+for each set of weights (`evaluation.calibration`, `cfr calibrate`). The coefficients are kept with
+the weights: as a note in their file, and in the parameters as `params["calibration"]`. There they
+are a part of the tree without leaves: gradients, optimizers and `jax.tree.map` skip it, a compiled
+program has its numbers built in, and the networks ignore it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from typing import Any, Literal
 import jax
 
 KEY = "calibration"
-"""What it is called in parameters, and among the notes of a file."""
+"""The name of a calibration in parameters and among the notes of a file."""
 BIAS = "bias"
-SURE = 30.0  # larger logits are rounding
+SURE = 30.0  # logits are clipped to this: beyond it, probabilities round to 0 or 1
 
 Coefficients = tuple[tuple[str, float], ...]
 
@@ -28,20 +28,20 @@ Coefficients = tuple[tuple[str, float], ...]
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """The coefficients of both confidences: of each clue by name, and the bias."""
+    """The coefficients of both confidences: one for each clue, by name, and the bias."""
 
     register: Coefficients
-    """For what `register` tells, from the network's clues."""
+    """For the confidence of `register`, from the network's clues."""
     align: Coefficients
-    """For what `align` tells, from those and the surfaces' clues."""
+    """For the confidence of `align`, from the network's and the surfaces' clues."""
 
     @classmethod
     def read(cls, text: str) -> Calibration:
-        """From a note; raises ValueError where it is damaged, which `write` never is."""
+        """Reads what `write` returned; raises ValueError if the note is damaged."""
         try:
             held = json.loads(text)
         except ValueError as error:
-            raise ValueError(f"calibration: the note is no JSON ({error})") from error
+            raise ValueError(f"calibration: the note is not valid JSON ({error})") from error
         if not isinstance(held, dict) or set(held) != {"register", "align"}:
             told = sorted(held) if isinstance(held, dict) else type(held).__name__
             raise ValueError(f"calibration: got {told}, wanted register and align")
@@ -49,36 +49,37 @@ class Calibration:
 
     @classmethod
     def of(cls, register: Mapping[str, float], align: Mapping[str, float]) -> Calibration:
-        """From coefficients by name; raises ValueError for what are none."""
+        """From coefficients by name; raises ValueError for a value that is not a finite number, and
+        if a bias is missing."""
         return cls(_checked("register", register), _checked("align", align))
 
     def write(self) -> str:
-        """As a note; numbers keep all their digits."""
+        """As a note (JSON); numbers keep all their digits."""
         return json.dumps({"register": dict(self.register), "align": dict(self.align)})
 
     def check(self, which: Literal["register", "align"], clues: Collection[str]) -> None:
-        """Raises ValueError unless the coefficients of one confidence are of these clues."""
+        """Raises ValueError unless one confidence's coefficients are for exactly these clues."""
         found = {clue for clue, _ in getattr(self, which)} - {BIAS}
         if found != set(clues):
             differing = ", ".join(sorted(found ^ set(clues)))
             raise ValueError(
-                f"calibration: {which} has other clues than are known here ({differing}); "
-                "`cfr calibrate` fits it anew"
+                f"calibration: {which} has other clues than this version knows ({differing}); "
+                "run `cfr calibrate` to fit it again"
             )
 
 
 def calibration_of(params: Mapping[str, Any]) -> Calibration | None:
-    """What the parameters carry; None where nobody calibrated them."""
+    """The calibration in the parameters; None if they were never calibrated."""
     return params.get(KEY)
 
 
 def uncalibrated(params: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters alone: what is trained, and what others are fitted to anew."""
+    """The parameters without their calibration, to train them or to fit a new calibration."""
     return {name: branch for name, branch in params.items() if name != KEY}
 
 
 def logit(fitted: Coefficients, clues: Mapping[str, Any]) -> Any:
-    """The bias and the weighted sum of the clues, by name."""
+    """The bias plus the weighted sum of the clues, which are matched by name."""
     weights = dict(fitted)
     return weights[BIAS] + sum(weight * clues[name] for name, weight in fitted if name != BIAS)
 

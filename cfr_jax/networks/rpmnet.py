@@ -1,8 +1,9 @@
-"""RPM-Net (Yew & Lee, CVPR 2020), the method that CFR starts from and is measured against.
+"""RPM-Net (Yew & Lee, CVPR 2020), the method that CFR builds on and is compared with.
 
-Every iteration extracts the features of both clouds again, predicts its own annealing parameters
-and normalizes in log space with five passes. `optimized` is the paper's RPMNet (Optim): log-free
-Sinkhorn, and neighborhoods searched once (a rigid motion does not change them); same answers.
+Every iteration extracts the features of both clouds again, predicts its own annealing parameters,
+and normalizes in log space with five passes. `optimized` is RPMNet (Optim) of the CFR paper: it
+uses log-free Sinkhorn and searches neighborhoods only once, as a rigid motion does not change them.
+The answers are the same.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from cfr_jax.networks.parts import (
     matching,
     move,
 )
-from cfr_jax.networks.record import Checkpoint, Network, Part, Place, Step, places_of
+from cfr_jax.networks.record import Checkpoint, Network, Params, Part, Place, Step, places_of
 from cfr_jax.networks.sinkhorn import Affinity, Form, match
 
 _WIDTHS = (96, 96, 192)
@@ -69,7 +70,7 @@ _LAYERS = (
 
 @dataclasses.dataclass(frozen=True)
 class RPMNetSettings:
-    """The published ones; tested with five iterations, trained with two."""
+    """The published settings, for testing with five iterations; it was trained with two."""
 
     neighbors: int = 64
     radius: float = 0.3
@@ -79,7 +80,7 @@ class RPMNetSettings:
 
 
 class Features(nn.Module):
-    """MLP on every neighbor, maximum, MLP on every point; unit rows."""
+    """An MLP on every neighbor, the maximum, and an MLP on every point; rows have length one."""
 
     @nn.compact
     def __call__(
@@ -100,22 +101,24 @@ class RPMNet(nn.Module):
     """The two learned parts, shared by all iterations."""
 
     def setup(self) -> None:
-        self.features = Features()
-        self.annealing = AnnealingNet(iterations=1)
+        self.features: Features = Features()
+        self.annealing: AnnealingNet = AnnealingNet(iterations=1)
 
     def __call__(self, raw: Array, source: Array, target: Array) -> object:
-        """Touches every part once, so that `init` makes all parameters."""
+        """Runs every part once, so that `init` makes all parameters."""
         return self.features(raw), self.annealing(source, target)
 
 
-def init_params(key: jax.Array, iterations: int | None = None) -> dict:
-    """Fresh parameters, a pytree of float32 arrays; any number of `iterations` shares them."""
+def init_params(key: jax.Array, iterations: int | None = None) -> Params:
+    """Fresh parameters, a pytree of float32 arrays; they do not depend on `iterations`."""
     points, raw = jnp.zeros((2, 3)), jnp.zeros((2, 1, _RAW_CHANNELS))
     return RPMNet().init(key, raw, points, points)["params"]
 
 
-def unroll(params: dict, source: Cloud, target: Cloud, settings: RPMNetSettings) -> Iterator[Step]:
-    """The iterations, one by one; the clouds' `neighbors` are not used.
+def unroll(
+    params: Params, source: Cloud, target: Cloud, settings: RPMNetSettings
+) -> Iterator[Step]:
+    """Yields the iterations one by one; does not use the `neighbors` of the clouds.
 
     As published, no gradient flows through the motion between two iterations.
     """
@@ -144,26 +147,26 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: RPMNetSettings)
         moved = moved_by(lax.stop_gradient(transform), source)
 
 
-def bind(params: dict) -> RPMNet:
-    """The network with its parameters inside."""
+def bind(params: Params) -> RPMNet:
+    """The network with these parameters bound to it."""
     return RPMNet().bind({"params": params})
 
 
 def find_neighbors(cloud: Cloud, settings: RPMNetSettings) -> Int32[Array, "n k"]:
-    """The neighborhoods of a cloud where it is now."""
+    """The neighborhoods of a cloud at its current position."""
     return first_in_ball(
         lax.stop_gradient(cloud.points), settings.neighbors, settings.radius, cloud.mask
     )
 
 
 def extract(network: RPMNet, cloud: Cloud, neighbors: Int32[Array, "n k"]) -> Float[Array, "n 96"]:
-    """The features of a cloud where it is now; unit rows."""
+    """The features of a cloud at its current position; rows have length one."""
     raw = raw_features(cloud.points, cloud.normals, neighbors, ppf="angle", position=True)
     return network.features(raw, cloud.mask)
 
 
-def parts(params: dict, settings: RPMNetSettings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
-    """All parts of the registration of two clouds, for timing."""
+def parts(params: Params, settings: RPMNetSettings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
+    """A function that yields all parts of the registration of two clouds, for timing."""
     network, count = bind(params), settings.iterations
     search = jax.jit(lambda cloud: find_neighbors(cloud, settings))
     extracted = jax.jit(lambda cloud, ball: extract(network, cloud, ball))

@@ -1,13 +1,13 @@
-"""The table of networks: where everything that needs one looks it up.
+"""The table of networks, where all other code looks them up.
 
-A new network is a file of its own and a line in `_BUILT_IN`. One from outside the package is
-registered by a call:
+A new network is a file of its own and a line in `_BUILT_IN`. To add one from outside the package,
+for example in a config file, call:
 
     from cfr_jax.networks.table import register_network
 
-    register_network(my_network)   # a `record.Network`, before its name is used; a config is Python
+    register_network(my_network)   # a `record.Network`, before its name is used
 
-Nothing here imports JAX: the record of a network is loaded once somebody asks for it.
+Nothing here imports JAX: the record of a network is loaded when it is first asked for.
 """
 
 from __future__ import annotations
@@ -19,21 +19,24 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from cfr_jax.networks.record import Network
 
-# By name, the module whose `NETWORK` is the record.
+# From the name of a network to the module with its record, `NETWORK`.
 _BUILT_IN = {
     "cfr": "cfr_jax.networks.cfr.network",
     "rpmnet": "cfr_jax.networks.rpmnet",
+    "dcp": "cfr_jax.networks.peers.dcp",
+    "fmr": "cfr_jax.networks.peers.fmr",
+    "rgm": "cfr_jax.networks.peers.rgm",
 }
 _registered: dict[str, Network] = {}
 
 
 def names() -> tuple[str, ...]:
-    """All networks there are, those registered from outside last."""
+    """The names of all networks; those registered from outside come last."""
     return (*_BUILT_IN, *_registered)
 
 
 def network(name: str) -> Network:
-    """The record of a network; raises ValueError, naming those that there are, for another name."""
+    """The record of a network; raises a ValueError that lists all names for an unknown one."""
     if name in _registered:
         return _registered[name]
     if name not in _BUILT_IN:
@@ -45,7 +48,7 @@ def network(name: str) -> Network:
 def register_network(record: Network) -> None:
     """Adds a network from outside the package, for this process.
 
-    The same record may be registered again. Raises ValueError for a name that is taken.
+    The same record may be registered again. Raises ValueError if another network has its name.
     """
     if record.name in _BUILT_IN or _registered.get(record.name, record) != record:
         raise ValueError(f"network: the name {record.name!r} is taken by another network")
@@ -53,16 +56,16 @@ def register_network(record: Network) -> None:
 
 
 def have(record: Network) -> None:
-    """Registers a network that came from another process, unless it is there already."""
+    """Registers a network that came from another process, unless it is known already."""
     if record.name not in _BUILT_IN:
         register_network(record)
 
 
 def recognize(tensors: Collection[str]) -> Network:
-    """The network that a file with tensors of these names holds; raises ValueError for none."""
+    """The network whose weights have tensors of these names; raises ValueError if none does."""
     for record in map(network, names()):
         if record.recognizes(tensors):
             return record
     titles = ", ".join(record.title for record in map(network, names()))
     some = ", ".join(sorted(tensors)[:3]) or "none"
-    raise ValueError(f"no network that is known ({titles}) has these tensors: {some}")
+    raise ValueError(f"no known network ({titles}) has these tensors: {some}")

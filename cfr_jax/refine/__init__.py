@@ -70,6 +70,12 @@ _TABLE = {
             library="small_gicp",
         ),
         Refinement(
+            "all_points",
+            "generalized ICP on all points, by small_gicp where it is installed",
+            f"{_HERE}.all_points:refine",
+            every_point=True,
+        ),
+        Refinement(
             "pyramid",
             "our own generalized ICP on all points, from coarse to fine",
             f"{_HERE}.pyramid:refine",

@@ -1,9 +1,10 @@
-"""Refinement on all points of large clouds, from the answer of thinned ones.
+"""Refinement on all points of large clouds, from an answer found on thinned ones.
 
-The usual pyramid of voxel grids: the network and the first refinement see a thousand points, then
-come a grid eight times as full and the clouds themselves, each with a narrower cut. The steps are
-those of `generalized_icp`. The closest points come from a KD-tree on the host, and the sums are
-taken over some thousand pairs at a time, so memory grows with the clouds and nothing else.
+It is the usual pyramid of voxel grids. The network and the first refinement see a thousand points.
+Then follow a grid with eight times as many points and the clouds themselves, each with a narrower
+cut. The steps are those of `generalized_icp`. The closest points come from a KD-tree on the host,
+and the sums are taken over a few thousand pairs at a time, so that memory grows with the clouds
+only.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ def refine(source: HostSurface, target: HostSurface, initial: Float[np.ndarray, 
     before, after = (_score(*level, motion, cut) for motion in (initial, transform))
     improved = after <= before
     transform = transform if improved else initial
-    return Fit(transform, improved, settled, steps, *_measure(*level, transform))
+    return Fit(transform, improved, settled, steps)
 
 
 def _level(surface: HostSurface, budget: int) -> Level:
@@ -165,11 +166,3 @@ def _score(source: Level, target: Level, transform: np.ndarray, cut: float) -> f
     """`generalized_icp.scores` of one motion, by the tree."""
     distance, _ = _pairs(source, target, transform, cut)
     return float(np.mean(1 - (1 - np.minimum(distance / cut, 1) ** 2) ** 3))
-
-
-def _measure(source: Level, target: Level, transform: np.ndarray) -> tuple[float, float]:
-    """Fitness and inlier error."""
-    distance, _ = _pairs(source, target, transform, CUT)
-    near = distance[np.isfinite(distance)]
-    rmse = float(np.sqrt(np.mean(near**2))) if len(near) else 0.0
-    return len(near) / len(distance), rmse

@@ -27,8 +27,8 @@ def refine(
     """GICP from `initial`, which maps source onto target, `iterations` for each of `distances`.
 
     Pairs further apart than the distance are rejected. The covariance of a point comes from its
-    `neighbors` nearest points; normals are not used. Whether the answer is any better than
-    `initial` is not asked.
+    `neighbors` nearest points; normals are not used. It does not check whether the result is
+    better than `initial`.
     """
     small_gicp = require("small_gicp")
     (moving, _), (cloud, tree) = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sized
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
@@ -12,7 +12,14 @@ _SECONDS = 10.0  # between plain lines
 _PLAIN = "{desc}: {n_fmt} of {total_fmt}{unit}, {elapsed} so far, about {remaining} left{postfix}"
 
 
-class Progress(tqdm):
+# Generic to type checkers alone.
+if TYPE_CHECKING:
+    _Bar = tqdm[Any]
+else:
+    _Bar = tqdm
+
+
+class Progress(_Bar):
     """A `tqdm` that, if its stream is not a terminal, writes a plain line every ten seconds."""
 
     def __init__(self, *args: Any, **options: Any):

@@ -27,6 +27,8 @@ class OnDemand(Sequence[Item], Generic[Item]):
     def __getitem__(self, index: int | slice) -> Any:
         if isinstance(index, slice):
             return [self[row] for row in range(len(self))[index]]
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index: got {index}, wanted one of {len(self)} pairs")
         return self._make(self._rows[index])
 
 

@@ -1,1 +1,1 @@
-"""Training: a pure step, and all that stands around it; `loop.run` is the way in."""
+"""Training: a pure step, and everything around it; start at `loop.run`."""

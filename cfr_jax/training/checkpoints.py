@@ -1,14 +1,14 @@
-"""Checkpoints of a training: whole or not there, checked before they are used.
+"""Checkpoints of a training: each is complete or absent, and is verified before it is used.
 
     checkpoints/1500/state/...      what orbax wrote
     checkpoints/1500/about.json     config, position in the data, measurements, versions
-    checkpoints/1500/manifest.json  SHA-256 of all of that
+    checkpoints/1500/manifest.json  SHA-256 of all these files
 
-A checkpoint is written in `checkpoints/.unfinished`, its manifest last, and appears by a rename:
-a process killed at any moment leaves the ones before it as they were. One that is found damaged is
-renamed to `1500.damaged`, and the newest sound one before it is used. (Orbax's CheckpointManager
-renames as well, but writes into a checkpoint after it calls back for the last time, so that no
-manifest could name all files.)
+A checkpoint is written in `checkpoints/.unfinished`, with its manifest last, and then renamed. If
+the process is killed at any moment, the earlier checkpoints stay as they were. A damaged checkpoint
+is renamed to `1500.damaged`, and the newest sound one before it is used. (Orbax's CheckpointManager
+also renames, but it writes into a checkpoint after its last callback, so no manifest could list all
+files.)
 """
 
 from __future__ import annotations
@@ -35,21 +35,22 @@ _UNFINISHED = ".unfinished"
 
 
 class SaveError(OSError):
-    """A checkpoint could not be written; says where, why, and what is left."""
+    """A checkpoint could not be written; the message says where, why, and which one is left."""
 
 
 class Checkpoints:
     """The checkpoints in a folder; leaving the context waits for the last one.
 
-    Keeps the last `keep` and the best. With several processes all have to call every method, and
-    the folder has to be one and the same for all.
+    Keeps the last `keep` checkpoints and the best one. With several processes, all of them must
+    call every method, and the folder must be the same for all.
     """
 
     def __init__(self, folder: Path, keep: int):
-        self.folder, self._keep = Path(folder).absolute(), keep
+        self.folder: Path = Path(folder).absolute()
+        self._keep = keep
         self._writer = ocp.StandardCheckpointer()
         self._thread = ThreadPoolExecutor(1)
-        self._running: Future | None = None
+        self._running: Future[None] | None = None
         if is_first():
             self.folder.mkdir(parents=True, exist_ok=True)
             shutil.rmtree(self.folder / _UNFINISHED, ignore_errors=True)
@@ -62,26 +63,27 @@ class Checkpoints:
             if kind is None:
                 self.wait()
         finally:
-            # after an error the writing goes on to its end, and what it says is of no use
+            # after an error the writing still finishes, but its result no longer matters
             self._thread.shutdown()
             self._writer.close()
 
     def steps(self) -> list[int]:
-        """The steps that there are checkpoints of, damaged or not, oldest first."""
+        """The steps that have a checkpoint, oldest first; the checkpoints are not verified here."""
         return sorted(int(path.name) for path in self.folder.iterdir() if path.name.isdigit())
 
     def save(
         self,
         state: TrainState,
-        about: dict,
+        about: dict[str, Any],
         best: int | None = None,
         then: Callable[[TrainState], None] | None = None,
     ) -> None:
-        """Saves in the background; `about` is anything JSON holds, `best` the step to keep. Once
-        the checkpoint is there, the first process calls `then` with what was saved.
+        """Saves in the background, after waiting for the previous save.
 
-        Waits for the save before. Raises `SaveError` where that could not be written, and what
-        `then` raised.
+        `about` is any JSON value; `best` is the step of the checkpoint to keep. When the checkpoint
+        is complete, the first process calls `then` with the saved state. Raises `SaveError` if a
+        checkpoint, this one or the previous one, could not be written, and what the `then` of the
+        previous save raised.
         """
         self.wait()
         step = int(state.step)
@@ -98,16 +100,16 @@ class Checkpoints:
             self._running = self._thread.submit(_after, self._running, then, copy)
 
     def wait(self) -> None:
-        """Waits until what was saved is there; raises `SaveError` where it could not be written."""
+        """Waits until the last save is complete; raises `SaveError` if it could not be written."""
         running, self._running = self._running, None
         if running is not None:
             running.result()
 
-    def restore(self, like: TrainState) -> tuple[TrainState, dict] | None:
-        """The newest sound state and what was said about it; None if nothing was ever saved.
+    def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]] | None:
+        """The newest sound state and its `about`; None if nothing was ever saved.
 
-        Warns of each damaged one. Raises ValueError where all are damaged, each time anew, and
-        where the newest does not fit `like`.
+        Warns about each damaged checkpoint. Raises ValueError if all are damaged (again in every
+        call), and if the newest sound one does not have the structure of `like`.
         """
         step = agree(self._newest_sound() if is_first() else 0)
         if step < 0:
@@ -121,8 +123,8 @@ class Checkpoints:
             state = self._writer.restore(folder / "state", shapes)
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
-                f"{folder} holds another kind of training: was the network or the optimizer "
-                "changed in the config? Take another workdir, or the config of about.json there"
+                f"{folder} belongs to a different training: was the network or the optimizer "
+                "changed in the config? Use another workdir, or the config in about.json there"
             ) from error
         return state, json.loads((folder / "about.json").read_text("utf-8"))
 
@@ -141,7 +143,7 @@ class Checkpoints:
         if damaged:
             raise ValueError(
                 f"no sound checkpoint in {self.folder}: {len(damaged)} are damaged; "
-                "remove the folder to start anew"
+                "remove the folder to start over"
             )
         return -1
 
@@ -155,7 +157,7 @@ class Checkpoints:
             final = self.folder / str(step)
             shutil.rmtree(final, ignore_errors=True)
             beside.rename(final)
-        except Exception as error:  # orbax passes on whatever its storage says
+        except Exception as error:  # orbax passes on whatever its storage raises
             self._fail(step, error)
         steps = self.steps()
         for old in steps[: -self._keep]:
@@ -166,15 +168,15 @@ class Checkpoints:
         if is_first():
             shutil.rmtree(self.folder / _UNFINISHED, ignore_errors=True)
         left = self.steps()[-1:]
-        kept = f"the last good one is of step {left[0]}" if left else "there is none before it"
+        kept = f"the last good one is at step {left[0]}" if left else "there is none before it"
         why = " ".join(str(error).split())
         raise SaveError(
-            f"checkpoint of step {step} in {self.folder} could not be written; {kept}.\n"
+            f"the checkpoint of step {step} in {self.folder} could not be written; {kept}.\n"
             f"Make room or give another --workdir, then run the same command again ({why[:300]})"
         ) from error
 
 
-def _after(saved: Future, then: Callable[[TrainState], None], state: TrainState) -> None:
+def _after(saved: Future[None], then: Callable[[TrainState], None], state: TrainState) -> None:
     saved.result()
     if is_first():
         then(state)

@@ -1,8 +1,8 @@
-"""What a training is told: every field with its default, and its unit or its reason.
+"""The config of a training: every field with its default, and its unit or the reason for it.
 
-The defaults are the recipe for the open CAD corpus; a file in `configs/` states what differs.
-`train.py` sets fields by flags (`--config.train.peak_rate=3e-4`), one after the other and by the
-types written here; `checked` then looks at the whole.
+The defaults are the recipe for the open CAD corpus; a file in `configs/` states what differs. Flags
+of `train.py` set single fields (`--config.train.peak_rate=3e-4`), one after the other, according to
+the types given here. `checked` then checks the whole config.
 """
 
 # No `from __future__ import annotations`: ml_collections reads the types of the fields.
@@ -22,11 +22,11 @@ PLACES = ("host", "device")
 class DataSection:
     """Where pairs come from: a corpus file in the layout of ModelNet40, or sources by name.
 
-    `{"street": {"kind": "kitti", "path": ..., "repeat": 4}, ...}`: `data.mixture` explains the
-    kinds, and checks the settings of each.
+    Sources look like `{"street": {"kind": "kitti", "path": ..., "repeat": 4}, ...}`. `data.mixture`
+    explains the kinds and checks the settings of each.
     """
 
-    # `object`, which flags read as a path or as a Python literal
+    # typed as `object`, so that flags accept a path or a Python literal
     train: object = "data/open_cad/train.h5"  # `cfr data open-cad --out data/open_cad` makes it
     validation: object = "data/open_cad/val.h5"
 
@@ -41,24 +41,28 @@ class DataSection:
 
 @dataclass(slots=True)
 class SamplingSection:
-    """How training pairs are drawn: fields of `data.augment.Sampling`, which explains and checks
-    them."""
+    """How training pairs are drawn.
 
-    keep: Range = (0.55, 0.85)  # share left by each crop; the test protocol has 0.7
+    These are fields of `data.augment.Sampling`, which explains and checks them. A "share of pairs"
+    says how often something happens to a pair.
+    """
+
+    keep: Range = (0.55, 0.85)  # share of points that each crop keeps; the test protocol has 0.7
     angle: float = Sampling.angle  # degrees, per Euler angle
     translation: float = Sampling.translation
-    both_ways: float = 0.5  # of the pairs: each angle from [-angle, angle], not [0, angle]
-    near: float = 0.3  # of the pairs: smaller motions, as a second cascade sees them
-    centered: float = 0.4  # of the pairs: clouds about their own centroids, as `align` has them
-    any_orientation: float = 0.3  # of the shapes; the rest stand upright, as CAD models do
+    both_ways: float = 0.5  # share of pairs with angles from [-angle, angle], not [0, angle]
+    near: float = 0.3  # share of pairs with smaller motions, as a second cascade sees them
+    centered: float = 0.4  # share of pairs with each cloud about its own centroid, as in `align`
+    any_orientation: float = 0.3  # share of shapes; the rest stand upright, as CAD models do
     scale: Range = (0.8, 1.2)
-    uneven: float = 0.0  # of the pairs: clouds denser on one side, `density` times
-    density: Range = Sampling.density
-    outliers: Range = Sampling.outliers  # share of the points
+    uneven: float = 0.0  # share of pairs with clouds that are denser on one side
+    density: Range = Sampling.density  # how many times denser
+    outliers: Range = Sampling.outliers  # share of points
     noise: Range = Sampling.noise  # per axis
-    sensor_noise: float = 0.0  # of the pairs: along the rays of a depth sensor instead
+    sensor_noise: float = 0.0  # share of pairs with noise along a depth sensor's rays instead
     sensor_scale: Range = Sampling.sensor_scale  # standard deviation at the middle of the cloud
-    estimated_normals: float = 0.4  # of the pairs; users' clouds mostly have no exact ones
+    estimated_normals: float = 0.4  # share of pairs; users' clouds rarely have exact normals
+    copied: bool = Sampling.copied  # make both clouds from the same points of the shape
 
     def __post_init__(self) -> None:
         check_types(self, "sampling.")
@@ -66,12 +70,12 @@ class SamplingSection:
 
 @dataclass(slots=True)
 class Phase:
-    """A stretch of the curriculum."""
+    """A phase of the curriculum."""
 
     steps: int
-    points: int  # of each cloud
-    neighbors: int  # of each point
-    batch: int  # pairs of a step, of all devices together
+    points: int  # per cloud
+    neighbors: int  # per point
+    batch: int  # pairs per step, on all devices together
     sampling: dict[str, Any] = field(default_factory=dict)
     """Fields of `SamplingSection` that differ in this phase."""
 
@@ -94,24 +98,27 @@ class TrainSection:
     """Loss, optimizer, and how a step is computed."""
 
     optimizer: str = "adamw"  # one of `optimizers.OPTIMIZERS`
-    schedule: str = "cosine"  # one of `optimizers.SCHEDULES`, which `make_schedule` explains
+    schedule: str = "cosine"  # one of `optimizers.SCHEDULES`, explained in `make_schedule`
     peak_rate: float = 1e-3
     warmup: float = 0.1  # share of all steps
-    cooldown: float = 0.2  # the same; "wsd" and "trapezoid" have one
-    clip: float = 1.0  # norm of the whole gradient
+    cooldown: float = 0.2  # share of all steps; only for "wsd" and "trapezoid"
+    drops: tuple[float, ...] = ()  # shares of all steps after which the rate drops; for "stairs"
+    drop_factor: float = 0.1  # what a drop multiplies the rate by
+    clip: float = 1.0  # largest norm of the whole gradient
     weight_decay: float = 1e-5
-    correspondence_weight: float = 0.05  # of that loss beside the motion's
-    average_decay: float = 0.999  # of the average of the weights, which is validated and kept
-    # Of the learned layers' products: "float32"; "tensorfloat32", on a GPU; or "bfloat16", which
-    # also stores the activations of CFR's heavy extraction so. Geometry stays float32.
+    correspondence_weight: float = 0.05  # weight of the correspondence loss; the pose has 1
+    average_decay: float = 0.999  # decay of the averaged weights, which are validated and kept
+    # Precision of the products in learned layers: "float32"; "tensorfloat32", on a GPU; or
+    # "bfloat16", which also stores the activations of CFR's heavy extraction in bfloat16. Geometry
+    # stays float32.
     precision: str = "float32"
-    pairs_at_once: int = 1  # on an accelerator: as many as fit; their gradients are summed
-    max_skipped: int = 20  # steps in a row whose gradient is not finite, before it stops
-    draw: str = "host"  # where pairs are drawn; those of shapes can be on the "device"
-    workers: int = 1  # threads that draw on the host
-    steps_at_once: int = 1  # in one program, where the device draws
-    minutes: float = 0.0  # of the wall clock, instead of the only phase's steps; 0: those steps
-    start_from: str = ""  # weights to go on from, by name or path, instead of random ones
+    pairs_at_once: int = 1  # vectorized pairs per device; on an accelerator, as many as fit
+    max_skipped: int = 20  # steps in a row that may lack a finite gradient; after more, it stops
+    draw: str = "host"  # where pairs are drawn: "host", or "device" for pairs of shapes
+    workers: int = 1  # threads that draw pairs on the host
+    steps_at_once: int = 1  # steps per program, if the device draws
+    minutes: float = 0.0  # length in wall-clock time, for a single phase; 0: by the phase's steps
+    start_from: str = ""  # weights to start from, by name or path; "": random weights
 
     def __post_init__(self) -> None:
         check_types(self, "train.")
@@ -126,17 +133,20 @@ class TrainSection:
 
 @dataclass(slots=True)
 class TrainingConfig:
-    """All that `train.py` reads. A section may be given as a dict of its fields."""
+    """Everything that `train.py` reads. A section may be given as a dict of its fields."""
 
     seed: int = 0
-    network: str = "cfr"  # a name of `networks.table`
+    network: str = "cfr"  # a name in `networks.table`
     iterations: int = 5
-    shared: bool = False  # one light layer for all iterations, instead of one each
+    shared: bool = False  # one light layer for all iterations, instead of one for each
+    width: int = 0  # channels of the features of DCP and RGM; 0: as published
+    version: str = ""  # "v1" or "v2", for DCP
     settings: dict[str, Any] = field(default_factory=dict)
-    """Settings of the network other than its usual ones: of `networks.inputs.Settings` for CFR."""
+    """Settings of the network that differ from its usual ones; for CFR, fields of
+    `networks.inputs.Settings`."""
     data: DataSection = field(default_factory=DataSection)
-    # Clouds grow as training goes on: small ones learn the most per second at first, and the
-    # weights depend neither on the points nor on the neighbors (docs/training.md).
+    # Clouds grow during training: at first, small clouds teach the most per second, and the shapes
+    # of the weights depend neither on points nor on neighbors (docs/notes/training.md).
     phases: tuple[Phase, ...] = field(
         default_factory=lambda: (
             Phase(steps=3000, points=256, neighbors=24, batch=8),
@@ -148,12 +158,12 @@ class TrainingConfig:
     log_every: int = 50  # steps
     checkpoint_every: int = 250  # steps
     validate_every: int = 500  # steps
-    # all of val.h5: on 96, two flipped shapes decided which weights were best
+    # all of val.h5: with 96 pairs, two flipped shapes decided which weights were best
     validation_pairs: int = 465
-    keep_checkpoints: int = 2  # the last ones; the best is kept beside them
+    keep_checkpoints: int = 2  # how many of the last ones; the best is kept as well
 
     def __post_init__(self) -> None:
-        # made once more, sections are checked with what flags have set since
+        # sections are made again, which checks the values that flags have set since
         self.data = _made(DataSection, self.data, "data")
         self.sampling = _made(SamplingSection, self.sampling, "sampling")
         self.train = _made(TrainSection, self.train, "train")
@@ -167,18 +177,18 @@ class TrainingConfig:
         _check_length(self.train, self.phases)
 
     def sampling_of(self, phase: Phase, radius: float) -> Sampling:
-        """How pairs of a phase are drawn, their neighbors within the network's `radius`.
+        """How the pairs of a phase are drawn, with neighbors within the network's `radius`.
 
-        Raises ValueError, naming the field, where that cannot be.
+        Raises a ValueError that names the field for values that cannot be used.
         """
         given = dataclasses.asdict(self.sampling) | phase.sampling
         return Sampling(points=phase.points, neighbors=phase.neighbors, radius=radius, **given)
 
 
 def checked(config: object) -> TrainingConfig:
-    """A copy of a config, every value of which was checked.
+    """A copy of a config, with every value checked.
 
-    Raises ValueError, naming the field, for a value that cannot be used.
+    Raises a ValueError that names the field for a value that cannot be used.
     """
     if not isinstance(config, TrainingConfig):
         raise ValueError(
@@ -192,12 +202,13 @@ def _check_length(train: TrainSection, phases: tuple[Phase, ...]) -> None:
     if train.draw == "host" and (train.steps_at_once > 1 or train.minutes):
         raise ValueError(
             f"steps_at_once, minutes: got {train.steps_at_once} and {train.minutes}, wanted 1 and "
-            '0 where train.draw is "host": each batch comes by itself'
+            '0, because train.draw is "host"; train.draw="device" allows other values'
         )
-    if train.minutes and (len(phases) > 1 or train.schedule != "trapezoid"):
+    if train.minutes and (len(phases) > 1 or train.schedule not in ("trapezoid", "stairs")):
         raise ValueError(
             f"minutes: got {train.minutes} for {len(phases)} phases and schedule "
-            f"{train.schedule!r}, wanted one phase, whose steps then follow, and 'trapezoid'"
+            f"{train.schedule!r}, wanted one phase (its steps follow from the time) and "
+            "'trapezoid' or 'stairs'"
         )
     if train.minutes:
         return
@@ -205,7 +216,7 @@ def _check_length(train: TrainSection, phases: tuple[Phase, ...]) -> None:
         if phase.steps % train.steps_at_once:
             raise ValueError(
                 f"steps_at_once: got {train.steps_at_once}, wanted a divisor of the {phase.steps} "
-                "steps of a phase: the rest would be compiled anew"
+                "steps of a phase: a remainder would be compiled separately"
             )
 
 
@@ -216,7 +227,7 @@ def _made(kind: Any, given: Any, name: str) -> Any:
         raise ValueError(f"{name}: got {given!r}, wanted {kind.__name__} or a dict of its fields")
     try:
         return kind(**given)
-    except TypeError as error:  # names the field that is unknown or missing
+    except TypeError as error:  # its text names the unknown or missing field
         raise ValueError(f"{name}: {error}") from error
 
 

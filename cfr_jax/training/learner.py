@@ -1,4 +1,4 @@
-"""What is trained: a network by name, and the curriculum it goes through."""
+"""The network that is trained, looked up by name, and the phases of its curriculum."""
 
 from __future__ import annotations
 
@@ -10,32 +10,34 @@ from typing import Any
 import jax
 
 from cfr_jax.networks import table
-from cfr_jax.networks.record import Network, Unroll
+from cfr_jax.networks.record import Network, Objective, Unroll
 from cfr_jax.training.config import Phase, TrainingConfig
 
 
 @dataclasses.dataclass(frozen=True)
 class Learner:
-    """A network that can be trained, and how it is run in training and when it is validated."""
+    """A network that can be trained, with its settings for training and for validation."""
 
     fresh: Callable[[jax.Array], dict]
     unroll: Unroll
     trained: Callable[[int], Any]
-    """Settings by the number of neighbors."""
+    """From the number of neighbors to the settings for training."""
     validated: Any
+    objective: Objective | None
+    """What is minimized instead of `losses.pair_loss`."""
 
 
 def learner(config: TrainingConfig) -> Learner:
-    """The network of the table that `config.network` names.
+    """The network in the table that `config.network` names.
 
-    Raises ValueError for another, and for `config.settings` that it does not have.
+    Raises ValueError for an unknown name, and for `config.settings` that the network does not have.
     """
     record, changed = table.network(config.network), config.settings
     _check_settings(record, changed)
     of_training = dict(changed)
     if config.train.precision == "bfloat16":
         if "activations" not in _fields(record):
-            raise ValueError(f"precision: got 'bfloat16', which {record.name} does not have")
+            raise ValueError(f"precision: got 'bfloat16', which {record.name} does not support")
         of_training["activations"] = "bfloat16"
     variant = {name: getattr(config, name) for name in record.variants}
     return Learner(
@@ -45,6 +47,7 @@ def learner(config: TrainingConfig) -> Learner:
             record.trained(count, config.iterations), **of_training
         ),
         validated=dataclasses.replace(record.validated, **changed),
+        objective=record.objective,
     )
 
 
@@ -61,7 +64,7 @@ def _check_settings(record: Network, changed: dict[str, Any]) -> None:
 
 
 def remaining(phases: Sequence[Phase], step: int) -> Iterator[tuple[Phase, int]]:
-    """The phases that `step` has not finished, each with the number of its steps already done."""
+    """Yields the phases that are not finished at `step`, each with how many steps it has done."""
     for phase in phases:
         if step < phase.steps:
             yield phase, step

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,22 +19,22 @@ from cfr_jax.training.learner import remaining
 from cfr_jax.training.reporting.reporter import Reporter
 from cfr_jax.training.step import TrainState
 from cfr_jax.training.task import Task, fresh_params, prepare
-from cfr_jax.weights import files as weights
+from cfr_jax.weights.files import save_params
 
-_TRAINED = 0.97  # of the time left; the rest is for validations and checkpoints
+_TRAINED = 0.97  # share of the remaining time for steps; validations and checkpoints get the rest
 
 
-def run(config: TrainingConfig, workdir: Path) -> dict:
-    """Trains by `config` in `workdir`, going on where a checkpoint there left off.
+def run(config: TrainingConfig, workdir: Path) -> dict[str, Any]:
+    """Trains as `config` says in `workdir`; resumes from a checkpoint if there is one.
 
-    Writes `checkpoints/`, `metrics.jsonl` (a line each time something is measured),
-    `weights.safetensors` (the averaged weights of the best validation so far, those it began with
-    included where these were trained), and when it ends or is stopped `summary.html`. Returns the
-    best validation.
+    Writes `checkpoints/`, `metrics.jsonl` (one line per measurement), and `weights.safetensors`:
+    the averaged weights with the best validation so far. (If training starts from given weights,
+    these are validated too.) Writes `summary.html` when it ends or is stopped. Returns the best
+    validation.
 
-    Raises ValueError where config, data or checkpoints cannot be used, `Diverged` where gradients
-    or answers stay infinite, OSError where nothing can be written, and `Stopped` after SIGINT or
-    SIGTERM, once all is saved.
+    Raises ValueError if config, data or checkpoints cannot be used, OSError if files cannot be
+    written, `Diverged` if gradients stay infinite or NaN or if answers to validation pairs are, and
+    `Stopped` after SIGINT or SIGTERM, when everything is saved.
     """
     began = time.monotonic()
     if workdir.exists() and not workdir.is_dir():
@@ -48,7 +49,7 @@ def run(config: TrainingConfig, workdir: Path) -> dict:
         restored = checkpoints.restore(state)
         if restored is not None:
             state, before = restored
-            if config.train.minutes and before.get("steps"):  # they were decided then
+            if config.train.minutes and before.get("steps"):  # the first run has decided them
                 task = task.planned(before["steps"])
             told += identity.go_on(before, about, task.steps, workdir)
         drawing = make_drawing(config, task.mixture, task.mesh)
@@ -64,18 +65,18 @@ def run(config: TrainingConfig, workdir: Path) -> dict:
 
 @dataclasses.dataclass
 class _Training:
-    """A run from its start, or from a checkpoint, to its end; `about` tells where it is."""
+    """A run, from its start or a checkpoint to its end; `about` says where it is."""
 
     config: TrainingConfig
     workdir: Path
     task: Task
     state: TrainState
-    about: dict
+    about: dict[str, Any]
     checkpoints: Checkpoints
     reports: Reporter
     drawing: Drawing
     began: float
-    """When the command was given, by `time.monotonic`."""
+    """When the command started, by `time.monotonic`."""
 
     def __post_init__(self) -> None:
         self._placed = validation.place(
@@ -99,7 +100,7 @@ class _Training:
         with stopping.stop_requests() as requests:
             for phase, ran in remaining(self.task.phases, self.about["step"]):
                 self._go_through(phase, ran, requests)
-        if not self.about["best"]:  # stopped before its first validation, and cut short since
+        if not self.about["best"]:  # stopped before any validation, and then shortened by config
             self._validate()
             self._keep_best()
         self._take_note()
@@ -138,7 +139,7 @@ class _Training:
                 self.checkpoints.wait()
                 raise stopping.Stopped(
                     f"stopped at step {done} of {task.steps}, all saved; "
-                    "the same command goes on from there",
+                    "run the same command again to resume",
                     asked,
                 )
 
@@ -161,20 +162,22 @@ class _Training:
         self.reports.resume()
 
     def _keep_best(self) -> None:
-        """Writes the weights where they are the best so far and not yet in their file."""
+        """Writes the weights if they are the best so far and not yet in their file."""
         if self.about["best"].get("step") == self.about["step"] and devices.is_first():
             self._write_best(self.about["best"], self.state)
 
-    def _write_best(self, best: dict, state: TrainState) -> None:
-        """The weights of a state whose validation is `best`. In the middle of a training this is
-        done beside it, once the checkpoint is there that calls them so."""
+    def _write_best(self, best: dict[str, Any], state: TrainState) -> None:
+        """Writes the weights of a state whose validation is `best`.
+
+        During a training this runs in the background, after the checkpoint that names them best.
+        """
         file = self.workdir / identity.WEIGHTS
         if not identity.holds(file, best):
-            weights.save_params(file, state.average, identity.notes(self.config, best))
+            save_params(file, state.average, identity.notes(self.config, best))
 
     def _plan(self) -> None:
-        """As many steps as fit into `train.minutes`, by the speed that they have here."""
-        assert isinstance(self.drawing, DeviceDrawing)  # `task.prepare` saw to that
+        """Measures the speed, and plans as many steps as fit into `train.minutes`."""
+        assert isinstance(self.drawing, DeviceDrawing)  # the config was checked for this
         (phase,), at_once = self.task.phases, self.config.train.steps_at_once
         speed = self.drawing.speed(self._leg(phase), self.state)
         spent = time.monotonic() - self.began
@@ -204,6 +207,7 @@ class _Training:
             pairs_at_once=config.train.pairs_at_once,
             precision=config.train.precision,
             max_skipped=config.train.max_skipped,
+            objective=task.learner.objective,
         )
         return Leg(phase, task.samplings[task.phases.index(phase)], recipe)
 

@@ -1,4 +1,4 @@
-"""Optimizers and learning rates by name, as a config asks for them."""
+"""Optimizers and learning rates, by the names that configs use."""
 
 from __future__ import annotations
 
@@ -12,21 +12,23 @@ import optax.contrib
 from jax.typing import ArrayLike
 from jaxtyping import Array, Int, PyTree
 
-SCHEDULES = ("cosine", "wsd", "constant", "trapezoid")
+from cfr_jax.networks.peers.batch_norm import MOMENTUM, is_running
+
+SCHEDULES = ("cosine", "wsd", "constant", "trapezoid", "stairs")
 OPTIMIZERS = ("adamw", "adam", "lion", "sgd", "muon")
 
-# Smaller sides of the matrices that "muon" turns: below, they are a network's inputs and outputs;
-# above, orthogonalizing costs a tenth of a training step.
+# "muon" orthogonalizes matrices whose smaller side is in this range. Smaller ones are inputs and
+# outputs of a network; for larger ones it would cost a tenth of a training step.
 _HIDDEN = range(32, 129)
 
 
 @dataclasses.dataclass(frozen=True)
 class Trapezoid:
-    """A rate that rises from zero over the warm-up, stays, and falls to zero over the cooldown, in
-    straight lines; both are shares of all steps.
+    """A learning rate that rises from zero, stays at its peak, and falls to zero, all linearly.
 
-    The number of steps is no part of the compiled program: an optimizer made with this keeps it in
-    its state (`planned`), so it may be decided once the speed of a step is known.
+    `warmup` and `cooldown` are shares of all steps. The number of steps is not part of the compiled
+    program: an optimizer made with this schedule keeps it in its state (`planned`), so it can be
+    decided after the speed of a step is known.
     """
 
     peak_rate: float
@@ -39,15 +41,36 @@ class Trapezoid:
         return self.at(count, self.steps)
 
     def at(self, count: ArrayLike, steps: ArrayLike) -> Array:
-        """The same in a training of so many steps."""
+        """The rate of step `count` in a training of `steps` steps."""
         done, steps = jnp.asarray(count, jnp.float32), jnp.asarray(steps, jnp.float32)
         risen = (done + 1) / jnp.maximum(self.warmup * steps, 1)
         left = (steps - done) / jnp.maximum(self.cooldown * steps, 1)
         return self.peak_rate * jnp.clip(jnp.minimum(risen, left), 0, 1)
 
 
+@dataclasses.dataclass(frozen=True)
+class Stairs:
+    """A rate that becomes `factor` of itself at each of the `drops`, shares of all steps; planned
+    as a `Trapezoid`."""
+
+    peak_rate: float
+    steps: int
+    drops: tuple[float, ...]
+    factor: float
+
+    def __call__(self, count: ArrayLike) -> Array:
+        """The rate of step `count`, from 0."""
+        return self.at(count, self.steps)
+
+    def at(self, count: ArrayLike, steps: ArrayLike) -> Array:
+        """The same in a training of so many steps."""
+        done, steps = jnp.asarray(count, jnp.float32), jnp.asarray(steps, jnp.float32)
+        fallen = sum((done >= jnp.round(drop * steps)).astype(jnp.float32) for drop in self.drops)
+        return self.peak_rate * jnp.float32(self.factor) ** fallen
+
+
 class Planned(NamedTuple):
-    """Where in a training of how many steps an optimizer is."""
+    """The current step of an optimizer, and the number of steps of its training."""
 
     # optax finds the step by this name, which hides a method of tuples
     count: Int[Array, ""]  # type: ignore[assignment]
@@ -55,22 +78,31 @@ class Planned(NamedTuple):
 
 
 def planned(state: optax.OptState, steps: Int[Array, ""]) -> optax.OptState:
-    """An optimizer's state in a training of `steps` steps; the same where its schedule is not a
-    `Trapezoid`."""
+    """An optimizer's state for a training of `steps` steps; unchanged unless its schedule is a
+    `Trapezoid` or `Stairs`."""
     if optax.tree.get(state, "planned_steps") is None:
         return state
     return optax.tree.set(state, planned_steps=steps)
 
 
 def make_schedule(
-    kind: str, *, peak_rate: float, steps: int, warmup: float, cooldown: float = 0.2
+    kind: str,
+    *,
+    peak_rate: float,
+    steps: int,
+    warmup: float,
+    cooldown: float = 0.2,
+    drops: tuple[float, ...] = (),
+    factor: float = 0.1,
 ) -> optax.Schedule:
     """The learning rate over `steps` steps; `warmup` and `cooldown` are shares of them.
 
-    All but the last start at a 25th of the peak and rise over the warm-up. Then "cosine" falls to a
-    thousandth along half a wave; "wsd" (warm-up, stable, decay) stays until the cool-down and falls
-    to a thousandth in a straight line, so that a run can be made longer without starting anew;
-    "constant" stays. "trapezoid" is a `Trapezoid`.
+    "cosine", "wsd" and "constant" start at a 25th of the peak and rise during the warmup. Then
+    "cosine" falls along half a wave to a thousandth of the peak. "wsd" (warmup, stable, decay)
+    stays at the peak until the cooldown and falls linearly to a thousandth, so that a run can be
+    extended without starting over. "constant" stays at the peak. "trapezoid" is a `Trapezoid`,
+    "stairs" is `Stairs`.
+    Raises ValueError for an unknown name and for numbers that cannot be used.
     """
     if not steps > 0 or not peak_rate > 0:
         raise ValueError(f"schedule: got {steps} steps at {peak_rate}, wanted both positive")
@@ -81,6 +113,13 @@ def make_schedule(
         )
     if kind == "trapezoid":
         return Trapezoid(peak_rate, steps, warmup, cooldown)
+    if kind == "stairs":
+        if not (all(0 < drop < 1 for drop in drops) and 0 < factor <= 1):
+            raise ValueError(
+                f"schedule: got drops {drops} to {factor}, wanted shares of all steps, and of the "
+                "rate"
+            )
+        return Stairs(peak_rate, steps, drops, factor)
     rising = max(1, int(warmup * steps))
     start, end = peak_rate / 25, peak_rate / 1000
     if kind == "cosine":
@@ -99,15 +138,15 @@ def make_schedule(
 def make_optimizer(
     kind: str, schedule: optax.Schedule, *, clip: float, weight_decay: float
 ) -> optax.GradientTransformation:
-    """An optimizer behind a gradient clipped by global norm.
+    """An optimizer, after the gradient is clipped by its global norm.
 
-    "adamw", "lion" and "sgd" (Nesterov momentum 0.9) shrink the weights apart from the gradient.
-    "muon" (Jordan, 2024) orthogonalizes the momentum of hidden matrices, stacked ones each by
-    itself, scaled so that AdamW's rates suit it (Liu et al., 2025), and is AdamW with Nesterov's
-    momentum for the rest. "adam" adds `weight_decay` times the weights to the gradient first, as
-    the published trainings did.
+    "adamw", "lion" and "sgd" (Nesterov momentum 0.9) use decoupled weight decay. "muon" (Jordan,
+    2024) orthogonalizes the momentum of hidden matrices, each matrix of a stack by itself, and
+    scales it so that AdamW's rates suit it (Liu et al., 2025); all other weights use AdamW with
+    Nesterov momentum. "adam" adds `weight_decay` times the weights to the gradient first, as the
+    published trainings did. Raises ValueError for an unknown name.
     """
-    if isinstance(schedule, Trapezoid):
+    if isinstance(schedule, Trapezoid | Stairs):
         return optax.chain(
             make_optimizer(kind, _one, clip=clip, weight_decay=weight_decay),
             _scaled_by(schedule),
@@ -141,7 +180,19 @@ def _one(count: ArrayLike) -> Array:
     return jnp.ones((), jnp.float32)
 
 
-def _scaled_by(schedule: Trapezoid) -> optax.GradientTransformation:
+def keep_running(optimizer: optax.GradientTransformation) -> optax.GradientTransformation:
+    """The optimizer for all but the running statistics of batch norms (`peers.batch_norm`), which
+    follow those of the batches: by gradient descent at the published rate."""
+
+    def kinds(params: PyTree) -> PyTree:
+        return jax.tree.map_with_path(
+            lambda path, _: "running" if is_running(path) else "learned", params
+        )
+
+    return optax.partition({"learned": optimizer, "running": optax.sgd(MOMENTUM)}, kinds)
+
+
+def _scaled_by(schedule: Trapezoid | Stairs) -> optax.GradientTransformation:
     def init(params: PyTree) -> Planned:
         return Planned(jnp.zeros((), jnp.int32), jnp.asarray(schedule.steps, jnp.int32))
 
@@ -154,7 +205,7 @@ def _scaled_by(schedule: Trapezoid) -> optax.GradientTransformation:
 
 
 def _hidden_matrices(params: PyTree) -> PyTree:
-    """Which axes of a leaf are a hidden matrix's inputs and outputs, or None."""
+    """For each leaf, the axes of a hidden matrix's inputs and outputs, or None if it is not one."""
 
     def axes(leaf: Array) -> optax.contrib.MuonDimensionNumbers | None:
         if leaf.ndim < 2 or min(leaf.shape[-2:]) not in _HIDDEN:

@@ -18,36 +18,37 @@ from cfr_jax.data.augment import Sampling
 from cfr_jax.data.device_pairs import Shapes, draw_pairs
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks.inputs import Cloud
-from cfr_jax.networks.record import Unroll
+from cfr_jax.networks.peers.batch_norm import PAIRS
+from cfr_jax.networks.record import Objective, Params, Unroll
 from cfr_jax.training.devices import AXIS
-from cfr_jax.training.losses import PairLoss, pair_loss
+from cfr_jax.training.losses import PairLoss, goal_loss, pair_loss
 
 PRECISIONS = ("float32", "tensorfloat32", "bfloat16")
-# What the products of the learned layers run at: those whose precision is not stated in the
-# program. Distances, covariances, affinities and motions state theirs, and stay float32 in every
-# case. With "bfloat16" it is the heavy extraction's activations that are less precise
-# (`Settings.activations`). A CPU multiplies in float32 whatever is asked for.
+# The precision of the products in learned layers, that is, of all products whose precision is not
+# stated in the program. Distances, covariances, affinities and motions state theirs, and always
+# stay float32. With "bfloat16", the activations of the heavy extraction are less precise as well
+# (`Settings.activations`). A CPU always multiplies in float32.
 _PRODUCTS = {"float32": "float32", "tensorfloat32": "tensorfloat32", "bfloat16": "tensorfloat32"}
 
 
 @struct.dataclass
 class TrainState:
-    """All that a step changes."""
+    """Everything that a step changes."""
 
     step: Int[Array, ""]
-    params: dict
-    average: dict
+    params: Params
+    average: Params
     """Exponential moving average of the parameters: what is validated and shipped."""
     optimizer: optax.OptState
     skipped: Int[Array, ""]
-    """Steps left out because their gradient was not finite, or came after too many such."""
+    """Number of steps skipped because their gradient was not finite, or after too many of those."""
     skipped_in_row: Int[Array, ""]
-    """How many of them came last, one after the other."""
+    """How many of the latest steps were skipped, without a good one in between."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """What a step is compiled for."""
+    """What a step depends on when it is compiled."""
 
     unroll: Unroll
     settings: Hashable
@@ -58,10 +59,12 @@ class Recipe:
     pairs_at_once: int
     precision: str
     max_skipped: int
-    """How many steps in a row may be left out; after more, nothing changes any more."""
+    """How many steps in a row may be skipped; after more than these, nothing changes anymore."""
+    objective: Objective | None = None
+    """What is minimized instead of `pair_loss`."""
 
 
-def init_state(params: dict, optimizer: optax.GradientTransformation) -> TrainState:
+def init_state(params: Params, optimizer: optax.GradientTransformation) -> TrainState:
     """A state at step zero; the average starts as a copy, since the step donates both."""
     return TrainState(
         step=jnp.zeros((), jnp.int32),
@@ -74,15 +77,17 @@ def init_state(params: dict, optimizer: optax.GradientTransformation) -> TrainSt
 
 
 @functools.partial(jax.jit, static_argnames=("recipe",), donate_argnames=("state",))
-def train_step(state: TrainState, batch: dict, *, recipe: Recipe) -> tuple[TrainState, PairLoss]:
-    """One step on a batch of `data.batches`, its losses and errors pair by pair.
+def train_step(
+    state: TrainState, batch: dict[str, Array], *, recipe: Recipe
+) -> tuple[TrainState, PairLoss]:
+    """One step on a batch of `data.batches`; also returns losses and errors, pair by pair.
 
-    The pairs are spread evenly over the mesh. A device accumulates the gradient of its share,
-    `pairs_at_once` pairs vectorized and the rest one after the other, so that any batch fits: on
-    CPU one at a time keeps the activations in cache and is fastest, an accelerator wants many. A
-    step whose gradient is not finite changes nothing but the counts of skipped steps; once more
-    than `max_skipped` came in a row none changes anything, so that the loop, which looks but now
-    and then, finds it so.
+    The pairs are spread evenly over the mesh. Each device accumulates the gradient of its share
+    over groups of `pairs_at_once` vectorized pairs, so that any batch fits in memory. On a CPU, one
+    at a time keeps the activations in the cache and is fastest; an accelerator wants many. If the
+    gradient is not finite, a step only advances the counts of steps and skipped steps. After more
+    than `max_skipped` such steps in a row, no further step changes anything else either, so that
+    the loop, which checks only now and then, finds that state.
     """
     return _advance(state, batch, recipe)
 
@@ -98,8 +103,11 @@ def train_on_drawn(
     recipe: Recipe,
     sampling: Sampling,
 ) -> tuple[TrainState, PairLoss]:
-    """`k` steps in one go, each on pairs that the devices draw (`data.device_pairs`): shape
-    `items[i]` at place `positions[i]` of the stream. Losses of all k b pairs."""
+    """`k` steps at once, each on pairs that the devices draw (`data.device_pairs`).
+
+    Step i draws pairs of the shapes `items[i]` at the positions `positions[i]` of the stream. Also
+    returns the losses of all k b pairs.
+    """
 
     def draw(shapes: Shapes, seed: Array, items: Array, positions: Array) -> dict[str, Array]:
         return draw_pairs(shapes, seed, items, positions, sampling)
@@ -128,14 +136,14 @@ def _advance(
             mesh=recipe.mesh,
             in_specs=(P(), P(AXIS)),
             out_specs=P(),
-            check_vma=False,  # derivatives written by hand say nothing of devices
+            check_vma=False,  # hand-written derivatives do not declare how they vary over devices
         )(state.params, batch)
     lost = state.skipped_in_row > recipe.max_skipped
     sound = jnp.isfinite(optax.tree.norm(gradient)) & ~lost
     gradient = jax.tree.map(lambda leaf: jnp.where(sound, leaf, 0), gradient)
     updates, moments = recipe.optimizer.update(gradient, state.optimizer, state.params)
     params = optax.apply_updates(state.params, updates)
-    # early in a run a long average would still be the initial weights
+    # early in a run, a long average would still consist of the initial weights
     decay = jnp.minimum(recipe.average_decay, (1 + state.step) / (10 + state.step))
     average = jax.tree.map(lambda a, p: a + (1 - decay) * (p - a), state.average, params)
 
@@ -154,12 +162,16 @@ def _advance(
 
 
 def _mean_gradient(
-    params: dict, batch: dict[str, Array], *, recipe: Recipe
-) -> tuple[dict, PairLoss]:
+    params: Params, batch: dict[str, Array], *, recipe: Recipe
+) -> tuple[Params, PairLoss]:
     """The gradient of the mean loss over all devices, from this device's pairs of the batch."""
 
-    def loss(params: dict, pair: dict[str, Array]) -> tuple[Array, PairLoss]:
+    def loss(params: Params, pair: dict[str, Array]) -> tuple[Array, PairLoss]:
         source, target = (_cloud(pair, side) for side in ("source", "target"))
+        if recipe.objective is not None:
+            goal = recipe.objective(params, source, target, pair["transform"], recipe.settings)
+            measured = goal_loss(goal, pair["transform"])
+            return measured.total, measured
         measured = pair_loss(
             recipe.unroll(params, source, target, recipe.settings),
             source,
@@ -173,17 +185,18 @@ def _mean_gradient(
     size = len(batch["transform"])
     at_once = min(recipe.pairs_at_once, size)
 
-    def add(total: dict, pairs: dict[str, Array]) -> tuple[dict, PairLoss]:
-        if at_once == 1:  # a batch axis of one would send XLA's products down a slower path
+    def add(total: Params, pairs: dict[str, Array]) -> tuple[Params, PairLoss]:
+        # with a batch axis of length one, XLA would choose slower products
+        if at_once == 1 and recipe.objective is None:
             gradient, measured = gradient_of(params, jax.tree.map(lambda leaf: leaf[0], pairs))
             measured = jax.tree.map(lambda leaf: leaf[None], measured)
         else:
-            gradient, measured = jax.vmap(gradient_of, (None, 0))(params, pairs)
+            gradient, measured = jax.vmap(gradient_of, (None, 0), axis_name=PAIRS)(params, pairs)
             gradient = jax.tree.map(lambda leaf: leaf.sum(0), gradient)
         return jax.tree.map(jnp.add, total, gradient), measured
 
-    # Gradients are summed as they come: a map differentiated as a whole would keep the activations
-    # of all its pairs.
+    # Gradients are summed as they come: differentiating one map over all pairs would keep the
+    # activations of all of them.
     chunks = jax.tree.map(lambda leaf: leaf.reshape(-1, at_once, *leaf.shape[1:]), batch)
     total, measured = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), chunks)
     measured = jax.tree.map(lambda leaf: leaf.reshape(size, *leaf.shape[2:]), measured)
@@ -203,22 +216,24 @@ def _cloud(pair: dict[str, Array], side: str) -> Cloud:
 
 @functools.partial(jax.jit, static_argnames=("unroll", "settings", "mesh", "pairs_at_once"))
 def predict(
-    params: dict,
-    batch: dict,
+    params: Params,
+    batch: dict[str, Array],
     *,
     unroll: Unroll,
     settings: Hashable,
     mesh: Mesh,
     pairs_at_once: int = 1,
 ) -> Array:
-    """Transforms (b, L, 4, 4) of a batch that needs no training; each device takes its share,
-    `pairs_at_once` pairs vectorized and the rest one after the other, all in float32."""
+    """The transforms (b, L, 4, 4) of a batch, without training, in float32.
 
-    def of_pair(params: dict, pair: dict[str, Array]) -> Array:
+    Each device takes its share, in groups of `pairs_at_once` vectorized pairs.
+    """
+
+    def of_pair(params: Params, pair: dict[str, Array]) -> Array:
         source, target = (_cloud(pair, side) for side in ("source", "target"))
         return jnp.stack([step.transform for step in unroll(params, source, target, settings)])
 
-    def of_share(params: dict, pairs: dict[str, Array]) -> Array:
+    def of_share(params: Params, pairs: dict[str, Array]) -> Array:
         size = len(pairs["transform"])
         return jax.lax.map(
             functools.partial(of_pair, params),

@@ -1,4 +1,4 @@
-"""Why a training ends early: asked to, it ends its step and saves; diverged, it says so."""
+"""Reasons for a training to end early: it was asked to stop, and saves first, or it diverged."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import jax
 
 
 class Stopped(Exception):
-    """A training that was asked to stop has saved all it did; `signal` asked for it."""
+    """A training was asked to stop by `signal`, and has saved everything."""
 
     def __init__(self, message: str, number: int):
         super().__init__(message)
@@ -20,21 +20,21 @@ class Stopped(Exception):
 
 
 class Diverged(ValueError):
-    """The gradients, or what the weights answer, are no numbers any more."""
+    """The gradients, or the answers of the weights, are no longer finite."""
 
 
 class Requests:
-    """`received` is the first signal that came, or None."""
+    """`received` is the first signal that arrived, or None."""
 
     received: int | None = None
 
 
 @contextmanager
 def stop_requests() -> Iterator[Requests]:
-    """Within, the first SIGINT (Ctrl-C) or SIGTERM is only noted; the second acts as ever.
+    """Inside this context, the first SIGINT (Ctrl-C) or SIGTERM is only noted.
 
-    Of several processes none may stop alone while the others wait for it, so there, and outside a
-    program's main thread, signals act as ever from the first one on.
+    The second one acts as usual. If there are several processes, none may stop alone while the
+    others wait for it; so then, and outside the main thread, even the first signal acts as usual.
     """
     requests = Requests()
     usual: dict[int, Any] = {}

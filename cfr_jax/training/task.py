@@ -1,4 +1,4 @@
-"""All that a config asks for, opened and checked before anything is compiled."""
+"""Opens and checks everything that a config names, before anything is compiled."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.sharding import Mesh
 
@@ -20,48 +21,50 @@ from cfr_jax.data.mixture import (
     open_mixture,
 )
 from cfr_jax.networks.probability import uncalibrated
+from cfr_jax.networks.record import Params
 from cfr_jax.training import devices, optimizers
 from cfr_jax.training.config import Phase, TrainingConfig, checked
 from cfr_jax.training.learner import Learner, learner
-from cfr_jax.weights import files as weights
+from cfr_jax.weights.files import load_params
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Task:
-    """What is trained, on what, for how long, and what it is validated on."""
+    """What to train, on which data, for how long, and what to validate on."""
 
     learner: Learner
     mesh: Mesh
     phases: tuple[Phase, ...]
     samplings: tuple[Sampling, ...]
-    """One of each phase."""
+    """One for each phase."""
     mixture: Mixture
-    pairs: dict
-    """What is validated on, as one batch."""
+    pairs: dict[str, np.ndarray]
+    """The validation pairs, as one batch."""
     schedule: optax.Schedule
     optimizer: optax.GradientTransformation
     stamps: dict[str, str]
-    """Of the training and of the validation data: other text, other data."""
+    """Identify the training and the validation data: different data have different stamps."""
     told: tuple[str, ...]
-    """In words, for whoever watches."""
+    """Messages for the user."""
 
     @property
     def steps(self) -> int:
-        """Of all phases."""
+        """The steps of all phases together."""
         return sum(phase.steps for phase in self.phases)
 
     def planned(self, steps: int) -> Task:
-        """The same, its only phase `steps` long."""
+        """The same task, with `steps` steps in its only phase."""
         phase = dataclasses.replace(self.phases[0], steps=steps)
         schedule = dataclasses.replace(self.schedule, steps=steps)
         return dataclasses.replace(self, phases=(phase,), schedule=schedule)
 
 
 def prepare(config: TrainingConfig, workdir: Path) -> Task:
-    """The task of a config; refined truths, and that all scans can be read, are kept in `workdir`.
+    """The task of a config.
 
-    Raises ValueError, naming the field, where the config cannot be used, the data cannot be read,
-    or training and validation share a scan.
+    Refined truths are kept in `workdir`, and so is a note that all scans can be read. Raises a
+    ValueError that names the field if the config cannot be used, if the data cannot be read, or if
+    training and validation share a scan.
     """
     config = checked(config)
     chosen, mesh = learner(config), devices.make_mesh()
@@ -72,10 +75,12 @@ def prepare(config: TrainingConfig, workdir: Path) -> Task:
     schedule = optimizers.make_schedule(
         config.train.schedule,
         peak_rate=config.train.peak_rate,
-        # of minutes, how many steps they are is known later
+        # with minutes, the number of steps is known only later
         steps=1 if config.train.minutes else sum(phase.steps for phase in config.phases),
         warmup=config.train.warmup,
         cooldown=config.train.cooldown,
+        drops=config.train.drops,
+        factor=config.train.drop_factor,
     )
     optimizer = optimizers.make_optimizer(
         config.train.optimizer,
@@ -83,6 +88,8 @@ def prepare(config: TrainingConfig, workdir: Path) -> Task:
         clip=config.train.clip,
         weight_decay=config.train.weight_decay,
     )
+    if chosen.objective is not None:
+        optimizer = optimizers.keep_running(optimizer)
     mixture = open_mixture(config.data.train, workdir, "data.train")
     held_out = open_mixture(config.data.validation, workdir, "data.validation")
     check_apart(mixture, held_out)
@@ -112,22 +119,22 @@ def prepare(config: TrainingConfig, workdir: Path) -> Task:
     )
 
 
-def fresh_params(config: TrainingConfig, chosen: Learner) -> dict:
-    """The weights that a run begins with: those of `train.start_from`, or random ones.
+def fresh_params(config: TrainingConfig, chosen: Learner) -> Params:
+    """The weights that a run starts from: those of `train.start_from`, or random ones.
 
-    Raises ValueError where those do not have the iterations that the config asks for.
+    Raises ValueError if given weights do not have the shapes that the config asks for.
     """
     key = jax.random.key(config.seed)
     if not config.train.start_from:
         return jax.jit(chosen.fresh)(key)
-    # the calibration is of the weights as they were
-    params = uncalibrated(weights.load_params(config.train.start_from, config.network))
+    # the calibration would not fit the weights after training
+    params = uncalibrated(load_params(config.train.start_from, config.network))
     shapes = [jax.tree.map(jnp.shape, tree) for tree in (params, jax.eval_shape(chosen.fresh, key))]
     if shapes[0] != shapes[1]:
         raise ValueError(
-            f"train.start_from: {config.train.start_from} has other iterations than "
-            f"config.iterations = {config.iterations}, or shares its layer where config.shared "
-            "says otherwise (or the other way round); set both as they were"
+            f"train.start_from: {config.train.start_from} was not made with config.iterations = "
+            f"{config.iterations} and config.shared = {config.shared}; set both to what it was "
+            "made with"
         )
     return params
 
@@ -137,12 +144,12 @@ def _told(
 ) -> tuple[str, ...]:
     begun = config.train.start_from or "random numbers"
     told = [
-        f"training on {mixture.told()}, from {begun}; "
-        f"validated on {count} pairs of {held_out.told()}; all of it goes to {workdir}"
+        f"training on {mixture.told()}, starting from {begun}; "
+        f"validating on {count} pairs of {held_out.told()}; writing to {workdir}"
     ]
     if count < ENOUGH:
         told.append(
-            f"only {count} validation pairs: which weights are best is a matter of chance with "
-            f"fewer than {ENOUGH}"
+            f"only {count} validation pairs: with fewer than {ENOUGH}, the choice of the best "
+            "weights depends on chance"
         )
     return tuple(told)

@@ -1,21 +1,27 @@
-"""Errors of the network alone on held-out pairs, at full size."""
+"""Errors of the network alone on held-out pairs, at the usual size of clouds."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
 from cfr_jax.evaluation import metrics
+from cfr_jax.networks.record import Params
 from cfr_jax.training import devices, step, stopping
 from cfr_jax.training.learner import Learner
 
 _RECALL = 5.0, 0.1  # degrees, and radii
 
 
-def place(batch: dict, mesh: Mesh, pairs_at_once: int = 1) -> dict:
-    """The pairs of `mixture.fixed_pairs` over the devices, the last one repeated to fill them,
-    `pairs_at_once` (or all, if they are fewer) in each."""
+def place(batch: dict[str, np.ndarray], mesh: Mesh, pairs_at_once: int = 1) -> dict[str, jax.Array]:
+    """Spreads the pairs of `mixture.fixed_pairs` over the devices.
+
+    The last pair is repeated, so that each device has a multiple of `pairs_at_once` pairs (or
+    equally many, if they are fewer).
+    """
     count = len(batch["transform"])
     share = -(-count // mesh.size)
     share = -(-share // min(pairs_at_once, share)) * min(pairs_at_once, share)
@@ -26,16 +32,17 @@ def place(batch: dict, mesh: Mesh, pairs_at_once: int = 1) -> dict:
 
 def validate(
     chosen: Learner,
-    params: dict,
-    placed: dict,
+    params: Params,
+    placed: dict[str, jax.Array],
     truth: np.ndarray,
     mesh: Mesh,
     pairs_at_once: int = 1,
-) -> dict:
-    """Rotation (degrees) and translation errors of the last transform against `truth` (b, 4, 4),
-    their recall, and the mean rotation error of every iteration; and all transforms (b, L, 4, 4).
+) -> dict[str, Any]:
+    """Compares the transforms that the weights find with `truth` (b, 4, 4).
 
-    Raises `Diverged` where a transform is not finite.
+    Returns the rotation errors (degrees) and translation errors of the last transform, their
+    recall, the mean rotation error of every iteration, and all transforms (b, L, 4, 4). Raises
+    `Diverged` if a transform is not finite.
     """
     found = step.predict(
         params,
@@ -50,7 +57,8 @@ def validate(
     lost = np.count_nonzero(~np.isfinite(transforms).all(axis=(1, 2, 3)))
     if lost:
         raise stopping.Diverged(
-            f"the weights' answers to {lost} of {len(truth)} validation pairs are not finite.\n"
+            f"the answers of the weights to {lost} of {len(truth)} validation pairs are not "
+            "finite.\n"
             "Look for broken shapes among these pairs, or try a lower train.peak_rate"
         )
     rotation = metrics.err_r(transforms[:, -1], truth)
@@ -68,8 +76,8 @@ def validate(
     }
 
 
-def in_words(found: dict) -> str:
-    """A validation, as people read it."""
+def in_words(found: dict[str, Any]) -> str:
+    """A validation in words, on one line."""
     return (
         f"validation RE {found['rotation_mean']:.2f}° mean, "
         f"{found['rotation_median']:.2f}° median, TE {found['translation_mean']:.3f}, "

@@ -24,7 +24,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors.numpy import load
 
 from cfr_jax.networks import table
-from cfr_jax.networks.record import Checkpoint, Network
+from cfr_jax.networks.record import Checkpoint, Network, Params
 from cfr_jax.runtime.reading import contents
 from cfr_jax.runtime.words import Refused, shown
 
@@ -33,12 +33,12 @@ _LEAST_BUDGET, _BUDGET = 64 << 20, 4
 _MOST_OF_FAULTS = 400  # characters
 
 
-def convert(path: str | Path) -> dict:
-    """Parameters from a checkpoint by a network's authors, such as CFR or RPM-Net.
+def convert(path: str | Path) -> Params:
+    """Parameters from a checkpoint by a network's authors: CFR, RPM-Net, DCP, FMR or RGM.
 
     The names of the tensors decide which network it is; `weights.files.network_of` tells it from
-    the result. `path` is a PyTorch file (.pth or .pt; needs torch, which reads only tensors and
-    unpickles no objects), or a .safetensors or .npz file with the same tensors under the same
+    the result. `path` is a PyTorch file (.pth, .pt or .t7; needs torch, which reads only tensors
+    and unpickles no objects), or a .safetensors or .npz file with the same tensors under the same
     names. For CFR, all iterations in the file are kept. Raises ValueError, naming the tensors that
     are missing, unknown, of the wrong shape, or not finite (of many, the first), and for files that
     unfold to much more than their own size.
@@ -47,6 +47,7 @@ def convert(path: str | Path) -> dict:
     readers: dict[str, Callable[[bytes], dict[str, Any]]] = {
         ".pth": _read_torch,
         ".pt": _read_torch,
+        ".t7": _read_torch,
         ".safetensors": load,
         ".npz": _read_npz,
     }
@@ -65,7 +66,7 @@ def convert(path: str | Path) -> dict:
     return from_state_dict(state, shown(path))
 
 
-def from_state_dict(state: dict[str, np.ndarray], name: str = "state_dict") -> dict:
+def from_state_dict(state: dict[str, np.ndarray], name: str = "state_dict") -> Params:
     """`convert` for arrays that are already in memory. `name` is used in error messages."""
     for key, value in state.items():
         if not isinstance(key, str) or not isinstance(value, np.ndarray):
@@ -82,7 +83,11 @@ def from_state_dict(state: dict[str, np.ndarray], name: str = "state_dict") -> d
     ours = jax.eval_shape(fresh, jax.random.key(0))
     shapes = {key: leaf.shape for key, leaf in flatten_dict(ours, sep="/").items()}
     faults = [f"{theirs} is missing" for theirs in places if theirs not in state]
-    faults += [f"{shown(theirs)} is unknown" for theirs in state if theirs not in places]
+    faults += [
+        f"{shown(theirs)} is unknown"
+        for theirs in state
+        if theirs not in places and not theirs.endswith(checkpoint.passed_over)
+    ]
     found: dict[str, list[np.ndarray]] = {}
     for theirs, place in places.items():
         if theirs not in state:

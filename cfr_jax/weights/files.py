@@ -20,7 +20,7 @@ from safetensors.numpy import load, save
 from cfr_jax.networks import table
 from cfr_jax.networks.clues import NetworkClues
 from cfr_jax.networks.probability import KEY, Calibration, calibration_of, uncalibrated
-from cfr_jax.networks.record import Network
+from cfr_jax.networks.record import Network, Params
 from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.runtime.reading import contents, parse_json
 from cfr_jax.runtime.words import Refused, shown
@@ -37,7 +37,7 @@ class NoWeights(ValueError):
 class Weights:
     """Parameters and where they come from."""
 
-    params: dict
+    params: Params
     """Includes the calibration, if the file has one (`networks.probability`)."""
     name: str
     network: str
@@ -48,7 +48,7 @@ class Weights:
     """All other notes in the file."""
 
 
-def save_params(path: str | Path, params: dict, notes: dict[str, str] | None = None) -> None:
+def save_params(path: str | Path, params: Params, notes: dict[str, str] | None = None) -> None:
     """Writes parameters and notes about them (strings) to a temporary file, then renames it.
 
     The calibration of the parameters, if they have one, is also written as a note. Raises OSError,
@@ -67,7 +67,7 @@ def save_params(path: str | Path, params: dict, notes: dict[str, str] | None = N
         raise OSError(f"weights: {path} could not be written ({error})") from error
 
 
-def load_params(source: str | Path = DEFAULT, network: str = "cfr") -> dict:
+def load_params(source: str | Path = DEFAULT, network: str = "cfr") -> Params:
     """Parameters that ship with the package, by name, or from a .safetensors file, by path.
 
     They are a pytree of float32 arrays for `register`, or for the `unroll` of another `network` in
@@ -83,7 +83,7 @@ def shipped() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
 
 
-def network_of(params: dict) -> str:
+def network_of(params: Params) -> str:
     """The name of the network that the parameters are made for, recognized from their names."""
     return table.recognize(_flat(params)).name
 

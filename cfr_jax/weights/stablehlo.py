@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from cfr_jax.networks.cfr.registration import register
 from cfr_jax.networks.inputs import Settings, prepare
+from cfr_jax.networks.record import Params
 from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.runtime.reading import contents
 from cfr_jax.runtime.seals import sealed, unsealed
@@ -32,7 +33,7 @@ OUTPUTS = ("transform", "transforms", "weights", "covered")
 
 
 def export_register(
-    params: dict,
+    params: Params,
     *,
     points: int,
     platforms: Sequence[str] = ("cpu",),

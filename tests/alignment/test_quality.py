@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import solids
+from scipy.linalg import expm
 from scipy.spatial import cKDTree
 
 from cfr_jax.alignment import doubts, quality
@@ -101,6 +102,27 @@ def test_clouds_out_of_reach_have_no_fitness_no_error_and_nothing_that_holds_the
 
     assert found.fitness == 0 and found.inlier_rmse == 0
     assert np.isfinite(found.weakest).all() and not found.resistance.any()
+
+
+@pytest.mark.parametrize("shape", [solids.lopsided, solids.plane])
+def test_resistance_is_the_fit_that_nudges_both_ways_along_a_direction_lose(shape):
+    source, target = two_samplings(shape, 0, 0.005)
+    found = measured(source, target)
+    here, there = (np.asarray(s.points)[np.asarray(s.mask)] for s in surfaces(source, target))
+
+    def lost(twist):
+        generator = np.zeros((4, 4))
+        generator[:3, :3] = np.cross(twist[:3], np.eye(3)).T
+        generator[:3, 3] = twist[3:]
+        away = cKDTree(there).query(solids.move(expm(generator), here))[0]
+        return np.minimum(away / DISTANCE, 1) ** 2
+
+    for direction, resistance in zip(found.weakest, found.resistance, strict=True):
+        near, far = (
+            [lost(sign * size * direction).mean() for sign in (1, -1)] for size in (0.06, 0.15)
+        )
+        wanted = (min(far) - np.mean(near)) / max(1 - np.mean(near), 0.2)
+        assert resistance == pytest.approx(np.clip(wanted, 0, 1), abs=2e-3)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.005])

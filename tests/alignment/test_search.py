@@ -91,7 +91,7 @@ def test_what_fits_as_well_another_way_is_told_and_named():
     half = solids.motion(180, (0, 0, 1), (0, 0, 0))
     shifted = solids.motion(0, translation=(0.5, 0, 0))
     motions = np.stack([np.eye(4), half, solids.motion(90, (1, 0, 0)), shifted])
-    frames = Frames(np.zeros(3), np.zeros(3), 1.0, np.eye(4))
+    frames = Frames(np.zeros(3), np.zeros(3), 1.0, np.eye(4), 1.0)
     found = Search(motions, motions, np.array([0.8, 0.79, 0.3, 0.78]), frames, 4)
 
     rivals = search.rivals(found, solids.motion(3, translation=(0, 0, 0)))

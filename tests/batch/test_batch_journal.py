@@ -71,7 +71,7 @@ def test_a_kill_within_the_first_line_is_a_fresh_start(cut, tmp_path):
 @pytest.mark.parametrize("content", [b"my notes", b"my notes\n", b'{"a": 1}\n{"b": 2}\nhalf'])
 def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(content, tmp_path):
     (tmp_path / "j").write_bytes(content)
-    with pytest.raises(ValueError, match="is damaged|is no journal"):
+    with pytest.raises(ValueError, match="is damaged|is not a journal"):
         Journal(tmp_path / "j", MADE_WITH)
     assert (tmp_path / "j").read_bytes() == content
 

@@ -171,6 +171,23 @@ def test_shards_add_up_to_the_whole_table(tmp_path, quick):
     assert quick == [] and len(table(tmp_path / "results.csv")) == 5
 
 
+def test_all_points_are_used_unless_told_otherwise_and_the_journal_knows(
+    tmp_path, monkeypatch, capsys
+):
+    listed, asked = batch_samples.write_pairs(tmp_path, 2), []
+
+    def align_many(pairs, **options):
+        asked.append(options["all_points"])
+        return batch_samples.quick(list(pairs), **options)
+
+    monkeypatch.setattr(stream, "align_many", align_many)
+
+    assert run(listed) == 0 and run(listed, "--thinned", out="thinned.csv") == 0
+    assert asked == [True, False]
+    assert run(listed, "--thinned") == 2
+    assert "all_points True, not False" in capsys.readouterr().err
+
+
 def test_strict_tells_that_a_pair_failed(tmp_path):
     listed = batch_samples.write_pairs(tmp_path, 2)
     assert run(listed, "--strict") == 0

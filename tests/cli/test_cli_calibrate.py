@@ -58,7 +58,7 @@ def test_calibrated_weights_are_the_same_with_coefficients_beside(
     # then
     told = capsys.readouterr().out
     before, after = read_weights(bare), read_weights(made)
-    assert code == 0 and after.sha256 in told and "left out of the fit" in told
+    assert code == 0 and after.sha256 in told and "on shapes or pairs left out" in told
     np.testing.assert_array_equal(
         after.params["cascade"]["kernel"], before.params["cascade"]["kernel"]
     )
@@ -89,9 +89,9 @@ def test_a_check_measures_and_writes_a_figure_alone(data, answers, tmp_path, cap
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--check"], "carries no calibration to check; give --out"),
+        (["--check"], "has no calibration to check; give --out"),
         (["--out", "new.npz"], "--out: got new.npz, wanted a name that ends in .safetensors"),
-        (["--out", "bare.safetensors"], "bare.safetensors would be written over"),
+        (["--out", "bare.safetensors"], "bare.safetensors would be overwritten"),
         ([], "one of the arguments --out --check is required"),
         (["--out", "new.safetensors", "--check"], "not allowed with argument --out"),
         (["--out", "new.safetensors", "--pairs", "0"], "--pairs: got '0', wanted an integer"),

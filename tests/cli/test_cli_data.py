@@ -53,7 +53,10 @@ def test_half_of_the_categories_are_unseen_if_none_is_named(meshes, tmp_path, ca
     [
         (["build", "{meshes}", "--out", "{tmp}/no/such/dir"], "--out: there is no folder"),
         (["build", "{meshes}", "--out", "{tmp}/file.txt"], "--out: .* is a file"),
-        (["build", "{meshes}", "--out", "{tmp}/c.h5", "--unseen", "lamp"], "--unseen: one file"),
+        (
+            ["build", "{meshes}", "--out", "{tmp}/c.h5", "--unseen", "lamp"],
+            "--unseen: a single file",
+        ),
         (["build", "{meshes}", "--out", "{tmp}/c", "--unseen", "sofa"], "unseen: no mesh .*sofa"),
         (["build", "{meshes}", "--out", "{tmp}/c.h5", "--points", "3"], "--points: got 3"),
         (["build", "{tmp}/none", "--out", "{tmp}/c.h5"], "no folder"),

@@ -23,7 +23,7 @@ CLOUD = io.PointCloud(np.ones((3, 3)))
 def test_the_suffixes_on_offer_are_those_that_can_be_written(tmp_path):
     for suffix in outputs.cloud_suffixes():
         io.write(tmp_path / f"cloud{suffix}", CLOUD)
-    for suffix in {".las", ".laz", ".obj", ".stl", ".off", ".glb", ".bin", ".csv", ""}:
+    for suffix in {".las", ".laz", ".obj", ".stl", ".off", ".glb", ".bin", ".pts", ".e57", ""}:
         with pytest.raises(io.CloudFileError):
             io.write(tmp_path / f"cloud{suffix}", CLOUD)
 

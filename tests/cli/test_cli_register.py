@@ -284,12 +284,12 @@ def test_only_strict_makes_a_doubtful_answer_a_failure(changes, strict, pair, an
         (["--out", "moved.las"], "--out"),
         (["--out", "nowhere/moved.ply"], "there is no folder nowhere"),
         (["--out", "folder.ply"], "folder.ply is a folder"),
-        (["--out", "source.ply"], "source.ply would be written over"),
-        (["--out", "./link.ply"], "link.ply would be written over"),
-        (["--json", "x.ply", "--out", "x.ply"], "x.ply would be written over"),
+        (["--out", "source.ply"], "source.ply would be overwritten"),
+        (["--out", "./link.ply"], "link.ply would be overwritten"),
+        (["--json", "x.ply", "--out", "x.ply"], "x.ply would be overwritten"),
         (["--view", "page.png"], "--view"),
         (["--png", "picture.html"], "--png"),
-        (["--json", "/dev/null"], "no regular file"),
+        (["--json", "/dev/null"], "not a regular file"),
         (["--initial", "missing.npy"], "missing.npy: cannot be read"),
         (["--weights", "nosuch"], "nosuch"),
     ],
@@ -376,3 +376,20 @@ def test_in_a_process_of_its_own_it_keeps_what_it_compiled_and_says_nothing_else
     assert any((tmp_path / "cache").iterdir())
     assert second["seconds"]["compile"] < first["seconds"]["compile"]
     assert all(line.startswith("cfr register: warning") for line in runs[1].stderr.splitlines())
+
+
+@pytest.mark.parametrize(("options", "wanted"), [((), True), (("--thinned",), False)])
+def test_all_points_are_used_unless_told_otherwise(pair, answering, options, wanted):
+    calls = answering()
+
+    assert main(["register", *pair, *options]) == 0
+
+    assert calls[0]["all_points"] is wanted
+
+
+def test_the_old_option_is_refused_and_the_new_one_named(pair, answering, capsys):
+    answering()
+
+    assert main(["register", *pair, "--all-points"]) == 2
+
+    assert "--all-points: all points are used without it; --thinned" in capsys.readouterr().err

@@ -99,7 +99,7 @@ def test_a_cloud_that_is_gone_is_named_with_the_option_that_finds_it(result, tmp
 def test_a_file_with_other_points_is_refused(result, tmp_path, capsys):
     io.write(tmp_path / "source.ply", io.PointCloud(cli_samples.points(99, 0)))
     assert main(["view", str(tmp_path / "result.json")]) == 2
-    assert "99 points, the result is about 700" in capsys.readouterr().err
+    assert "99 points, but the result was made from 700" in capsys.readouterr().err
 
 
 def test_a_file_that_was_moved_in_space_is_shown_with_a_warning(result, tmp_path, capsys):
@@ -132,7 +132,7 @@ def test_what_is_no_result_is_refused(text, told, tmp_path, capsys):
         ("transform", "near", '"transform"'),
         ("transforms", [[[1, 0], [0, 1]]], "transforms"),
         ("transforms", None, '"transforms"'),
-        ("source", {"name": "a"}, '"source" lies'),
+        ("source", {"name": "a"}, '"source" is'),
         ("confidence", [], '"confidence"'),
         ("inlier_distance", "far", '"inlier_distance"'),
     ],

@@ -153,7 +153,7 @@ def test_pairs_of_a_file_are_read_one_by_one(tmp_path):
 
 
 def test_shapes_are_not_pairs(tmp_path):
-    with pytest.raises(ValueError, match="no pairs\n.*evaluate.py"):
+    with pytest.raises(ValueError, match="not pairs\n.*evaluate.py"):
         jobs_of(recognize(make("corpus", tmp_path)))
 
 

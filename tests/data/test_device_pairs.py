@@ -227,7 +227,7 @@ def test_shapes_far_from_the_unit_sphere_are_refused(corpus):
         Shapes.of(far)
 
 
-@pytest.mark.parametrize("platform", ["cuda", "tpu"])
+@pytest.mark.parametrize("platform", ["cuda", "rocm", "tpu"])
 def test_the_drawing_lowers_for_accelerators(corpus, platform):
     shapes = jax.tree.map(jnp.asarray, Shapes.of(corpus))
     items, positions = jnp.zeros(4, jnp.int32), jnp.zeros(4, jnp.uint32)

@@ -161,7 +161,7 @@ def test_a_call_that_was_cut_off_goes_on_and_not_with_other_weights(tmp_path, mo
     with pytest.raises(ValueError, match="keep: .* gathered with other weights"):
         fitting.gather(params, opened, 12, kept=kept, made_of="others")
     kept.write_bytes(b"nothing")
-    with pytest.raises(ValueError, match="keep: .* holds nothing gathered here"):
+    with pytest.raises(ValueError, match="keep: .* does not hold findings of trials"):
         fitting.gather(params, opened, 12, kept=kept, made_of="these")
 
 

@@ -1,5 +1,6 @@
 """The table of metrics: what it holds, and how one from outside is put there and shown."""
 
+import dataclasses
 import json
 
 import h5py
@@ -101,6 +102,27 @@ def test_a_metric_of_whole_shapes_is_not_measured_without_them():
 def test_a_name_is_given_once(table):
     with pytest.raises(ValueError, match="^name: got 'farthest', wanted one that is not taken"):
         metrics.add(TOY)
+
+
+@pytest.mark.parametrize("entry", [TOY, TOY.summaries[0]], ids=lambda entry: type(entry).__name__)
+def test_who_looks_an_entry_up_cannot_change_it(entry):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        entry.name = "nearest"
+
+
+def test_a_column_says_what_its_numbers_are_multiplied_by_where_they_are():
+    titles = {name: metrics.metric(name).summaries[0].title for name in ("err_r", "chamfer")}
+
+    assert titles == {"err_r": "RE mean", "chamfer": "CD mean ×1000"}
+
+
+@pytest.mark.parametrize("name", ["r_mae", "r_rmse", "t_mae", "t_rmse"])
+def test_pairs_are_summed_up_as_their_axes_are(name):
+    (summary,) = metrics.metric(name).summaries
+
+    found = summary.statistic(np.array([3.0, 4.0]), axis=0)
+
+    assert found == pytest.approx(3.5 if name.endswith("mae") else 12.5**0.5)
 
 
 def test_all_summaries_have_names_of_their_own_and_say_which_way_is_better():

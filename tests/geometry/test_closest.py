@@ -52,6 +52,15 @@ def test_if_no_point_is_valid_some_index_is_still_returned(search):
     assert ((found >= 0) & (found < 10)).all()
 
 
+@pytest.mark.parametrize("search", SEARCHES)
+def test_a_query_that_is_not_a_number_still_gets_an_index(search):
+    queries, points, mask = clouds(20, 10)
+
+    found = SEARCHES[search](*map(jnp.asarray, (queries * np.nan, points, mask)))
+
+    assert ((found >= 0) & (found < 10)).all()
+
+
 def test_the_distance_is_right_and_so_is_its_gradient():
     queries, points, _ = (jnp.asarray(part) for part in clouds())
 
@@ -68,6 +77,15 @@ def test_an_accelerator_needs_no_loop():
     shapes = [jax.ShapeDtypeStruct((n, 3), jnp.float32) for n in (4000, 5000)]
     program = jax.jit(closest).trace(*shapes)
 
-    for platform in ("cuda", "tpu", "cpu"):
+    for platform in ("cuda", "rocm", "tpu", "cpu"):
         text = program.lower(lowering_platforms=(platform,)).as_text()
         assert ("stablehlo.while" in text) == (platform == "cpu")
+
+
+def test_on_a_cpu_memory_does_not_grow_with_the_product_of_the_sizes():
+    shapes = [jax.ShapeDtypeStruct((n, 3), jnp.float32) for n in (20_000, 5000)]
+
+    compiled = jax.jit(closest).lower(*shapes).compile()
+
+    ranks = 4 * 20_000 * 5000
+    assert compiled.memory_analysis().temp_size_in_bytes < ranks / 20

@@ -1,6 +1,7 @@
 """All searches find the same sets as the plain one, including ties and duplicates."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -154,10 +155,28 @@ def test_a_batch_is_searched_like_single_clouds():
 def test_an_impossible_k_is_refused(k):
     points = np.zeros((5, 3), np.float32)
 
-    with pytest.raises(ValueError, match=rf"^k: got {k} neighbors for a cloud of 5 points"):
+    told = rf"^k: got {k} neighbors for a cloud of 5 points, wanted 1 <= k <= 4$"
+    with pytest.raises(ValueError, match=told):
         nearest(jnp.asarray(points), k)
-    with pytest.raises(ValueError, match=rf"^k: got {k} neighbors for a cloud of 5 points"):
+    with pytest.raises(ValueError, match=told):
         nearest_on_host(points, k)
+
+
+def test_a_large_cloud_on_the_host_is_searched_like_a_small_one():
+    points = np.random.default_rng(8).normal(size=(1600, 3)).astype(np.float32)
+
+    np.testing.assert_array_equal(
+        sets(nearest_on_host(points, 5)), sets(pieces.nearest_neighbors(points, 5))
+    )
+
+
+def test_on_a_cpu_memory_grows_with_the_cloud_and_not_with_its_square():
+    n = 8000
+    points = jax.ShapeDtypeStruct((n, 3), jnp.float32)
+
+    for search in (lambda x: nearest(x, 16), lambda x: first_in_ball(x, 16, 0.3)):
+        compiled = jax.jit(search).lower(points).compile()
+        assert compiled.memory_analysis().temp_size_in_bytes < 4 * n * n / 20
 
 
 @pytest.mark.parametrize("search", IN_BALL)
@@ -177,7 +196,7 @@ def test_balls_hold_their_first_points_by_index(name, k, search):
         np.testing.assert_array_equal(found[row], [*wanted, *[row] * (k - len(wanted))])
 
 
-@pytest.mark.parametrize(("platform", "most"), [("cuda", 0), ("tpu", 0), ("cpu", 2)])
+@pytest.mark.parametrize(("platform", "most"), [("cuda", 0), ("rocm", 0), ("tpu", 0), ("cpu", 2)])
 def test_an_accelerator_searches_without_a_loop(platform, most):
     points = jax.ShapeDtypeStruct((4000, 3), jnp.float32)
 
@@ -187,3 +206,26 @@ def test_an_accelerator_searches_without_a_loop(platform, most):
             text = jax.jit(program).trace(given).lower(lowering_platforms=(platform,)).as_text()
             loops = text.count("stablehlo.while")
             assert loops == 0 if most == 0 else 0 < loops <= most
+
+
+@pytest.mark.parametrize(("n", "most"), [(500, 500), (12_000, 12_000 / 6.5)])
+def test_an_accelerator_sorts_small_clouds_once_and_of_large_ones_a_seventh(n, most):
+    points = jax.ShapeDtypeStruct((n, 3), jnp.float32)
+
+    program = jax.jit(lambda x: nearest(x, 64)).trace(points)
+
+    text = program.lower(lowering_platforms=("cuda",)).as_text()
+    rows = [int(width) for width in re.findall(r"top_k.*tensor<\d+x(\d+)xf32>\)? ->", text)]
+    assert len(rows) == (1 if n == 500 else 2) and sum(rows) <= most
+
+
+@pytest.mark.parametrize("k", [1, 12, 30, 100])  # groups of eight, four, two, and points alone
+def test_a_block_of_rows_sorts_no_more_values_than_it_may(k):
+    points, entries = jax.ShapeDtypeStruct((125, 3), jnp.float32), 2500
+    search = functools.partial(neighbors._nearest_by_groups, few=8, entries=entries)
+
+    text = jax.jit(lambda x: search(x, None, k, np.inf)).trace(points).lower().as_text()
+
+    sizes = re.findall(r"top_k.*tensor<(\d+)x(\d+)xf32>\)? ->", text)
+    rows, widths = int(sizes[0][0]), [int(width) for _, width in sizes]
+    assert rows < 125 and (rows - 1) * sum(widths) <= entries

@@ -42,6 +42,32 @@ def test_normals_of_a_plane_are_exact():
     np.testing.assert_allclose(np.abs(found @ turn[:, 2]), 1, atol=1e-5)
 
 
+def test_a_normal_is_the_least_spread_of_its_weighted_neighborhood():
+    # the point itself counts one, a neighbor exp(-d^2 / 2 s^2), s 0.45 of the root mean square
+    # distance: what the weights were trained on
+    points = np.random.default_rng(6).normal(size=(40, 3)).astype(np.float32)
+    neighbors = nearest_on_host(points, 9)
+
+    found = normals_of(points, 9)
+
+    for point, around, normal in zip(points, neighbors, found, strict=True):
+        offset = np.vstack([np.zeros(3), points[around].astype(np.float64) - point])
+        square = (offset**2).sum(1)
+        weight = np.exp(-square / (2 * 0.45**2 * square[1:].mean()))
+        wanted = np.linalg.eigh(np.cov(offset.T, aweights=weight, ddof=0))[1][:, 0]
+        np.testing.assert_allclose(np.abs(normal @ wanted), 1, atol=1e-5)
+
+
+def test_normals_turn_away_from_the_centroid_of_the_valid_points_however_many_are_not():
+    points = ball(7, 100) + np.float32([3, 0, 0])
+    padded = np.concatenate([points, np.zeros((300, 3), np.float32)])
+    neighbors = np.concatenate([nearest_on_host(points, 12), np.zeros((300, 12), np.int32)])
+
+    found = estimate(jnp.asarray(padded), jnp.asarray(neighbors), jnp.arange(400) < 100)
+
+    assert (np.sum(found[:100] * ball(7, 100), axis=1) > 0.5).all()
+
+
 def test_normals_move_with_the_cloud():
     turn = Rotation.random(random_state=2).as_matrix()
     points = ball(2)

@@ -184,17 +184,22 @@ def twists(angle, count=50):
     return np.concatenate([turns, rng.normal(size=(count, 3))], axis=1)
 
 
+def exponentials(given):
+    """What scipy makes of twists."""
+    generators = np.zeros((len(given), 4, 4))
+    for row, (x, y, z) in enumerate(given[:, :3]):
+        generators[row, :3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    generators[:, :3, 3] = given[:, 3:]
+    return np.stack([expm(generator) for generator in generators])
+
+
 ANGLES = [0.0, 1e-8, 1e-4, 0.009, 0.011, 0.5, 2.0, 3.0, np.pi - 1e-3, np.pi - 1e-6]
 
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_exp_is_the_matrix_exponential_and_log_inverts_it(angle):
     given = twists(angle)
-    generators = np.zeros((len(given), 4, 4))
-    for row, (x, y, z) in enumerate(given[:, :3]):
-        generators[row, :3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
-    generators[:, :3, 3] = given[:, 3:]
-    wanted = np.stack([expm(generator) for generator in generators])
+    wanted = exponentials(given)
 
     found = exp(jnp.asarray(given, jnp.float32))
     back = log(found)
@@ -205,6 +210,18 @@ def test_exp_is_the_matrix_exponential_and_log_inverts_it(angle):
     if angle < 3.1:
         np.testing.assert_allclose(back, given, atol=2e-5)
     assert np.linalg.norm(back[:, :3], axis=1).max() <= np.pi + 1e-5
+
+
+@pytest.mark.parametrize("angle", [1e-5, 1e-3, 0.009, 0.011, 0.5])
+def test_exp_and_log_meet_their_series_in_double_precision(x64, angle):
+    given = twists(angle, 5)
+
+    found = exp(jnp.asarray(given))
+    back = log(jnp.asarray(exponentials(given)))
+
+    # each series stops where its next term would add less than this
+    np.testing.assert_allclose(found, exponentials(given), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(back, given, rtol=0, atol=4e-7 * angle)
 
 
 @pytest.mark.parametrize("angle", ANGLES)

@@ -103,7 +103,7 @@ def test_cfr_register_reads_and_writes_a_format_from_outside(toys, tmp_path, mon
     assert main(["register", "--help"]) == 0
     told = capsys.readouterr().out
     assert ".toy (a toy)" in told and re.search(r"surfaces .*\.toym", told)
-    assert main(["register", str(source), str(target), "--out", "moved.e57"]) == 2
+    assert main(["register", str(source), str(target), "--out", "moved.abc"]) == 2
     assert ".npz .toy" in capsys.readouterr().err
 
 
@@ -117,11 +117,11 @@ def test_folders_of_a_format_from_outside_are_recognized(toys, tmp_path):
 
 
 def test_an_unknown_suffix_is_answered_with_all_known_ones(toys, tmp_path):
-    (tmp_path / "cloud.e57").touch()
+    (tmp_path / "cloud.abc").touch()
     listed = " ".join(formats.by_suffix(formats.known()))
     assert listed.startswith(".ply .pcd ") and listed.endswith(" .toy .toym")
     with pytest.raises(CloudFileError, match=f"wanted one of {re.escape(listed)}$"):
-        read(tmp_path / "cloud.e57")
+        read(tmp_path / "cloud.abc")
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ sys.exit(f"{heavy}" if heavy else "jax" in sys.modules)
 @pytest.mark.parametrize(
     ("page", "listed"),
     [
-        ("recipes.md", formats.known()),
+        ("files.md", formats.known()),
         ("train-on-your-data.md", [form for form in formats.known() if form.loose]),
     ],
 )

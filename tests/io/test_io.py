@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from io_samples import COUNT, normals, pcd, points, surface, write_clouds, write_las, write_meshes
 
-from cfr_jax.io import CloudFileError, PointCloud, read, write
+from cfr_jax.io import CloudFileError, CloudWarning, PointCloud, read, write
 
 CLOUDS = (
     "text.ply", "little.ply", "big.ply", "text.pcd", "binary.pcd", "compressed.pcd", "plain.xyz",
@@ -207,9 +207,10 @@ def test_a_cloud_with_a_normal_missing_has_no_normals(marker, tmp_path):
     assert read(tmp_path / "cloud.ply").normals is None
 
 
-def test_three_more_columns_that_are_colors_are_no_normals(tmp_path):
+def test_three_more_columns_that_are_colors_are_no_normals_and_that_is_said(tmp_path):
     (tmp_path / "cloud.xyz").write_text("0 0 0 255 0 0\n1 1 1 0 128 0\n")
-    assert read(tmp_path / "cloud.xyz").normals is None
+    with pytest.warns(CloudWarning, match=r"cloud\.xyz: columns 4 to 6 are not unit vectors"):
+        assert read(tmp_path / "cloud.xyz").normals is None
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import trimesh
 from io_samples import normals, points, surface
 
 import cfr_jax.io
-from cfr_jax.io import CloudFileError, PointCloud, as_point_cloud, write
+from cfr_jax.io import CloudFileError, CloudWarning, PointCloud, as_point_cloud, write
 
 BOX_CORNERS = {tuple(row) for row in surface().vertices}
 
@@ -96,10 +96,25 @@ def test_one_point_is_a_cloud():
 
 
 def test_columns_four_to_six_are_normals_scaled_to_unit_length():
-    array = np.hstack([points(), 1e-200 * normals()])
+    array = np.hstack([points(), 1.01 * normals()])
     cloud = as_point_cloud(array, name="source")
     np.testing.assert_array_equal(cloud.points, points())
     np.testing.assert_allclose(cloud.normals, normals(), atol=1e-15)
+
+
+COLORS = np.random.default_rng(3).uniform(size=(60, 3))
+
+
+@pytest.mark.parametrize(
+    "last",
+    [255 * COLORS, COLORS, np.eye(3)[COLORS.argmax(axis=1)], np.zeros((60, 3)), COLORS * np.nan],
+    ids=["bytes", "shares", "labels", "zeros", "nan"],
+)
+def test_columns_four_to_six_that_are_colors_are_left_out_and_that_is_said(last):
+    with pytest.warns(CloudWarning, match="^source: the last three of six columns are no unit"):
+        cloud = as_point_cloud(np.hstack([points(), last]), name="source")
+    np.testing.assert_array_equal(cloud.points, points())
+    assert cloud.normals is None
 
 
 def test_the_normals_of_open3d_are_kept():
@@ -164,8 +179,6 @@ REFUSED = [
     (NAN_ROW, r"point 1 is \(0, nan, 0\)"),
     ([[np.inf, 0.0, 0.0]], r"point 0 is \(inf, 0, 0\)"),
     ([[1e13, 0.0, 0.0]], r"finite coordinates within ±1e\+12"),
-    ([[0.0, 0, 0, 0, 0, 0]], r"normal 0 is \(0, 0, 0\)"),
-    ([[0.0, 0, 0, 1, np.nan, 0]], r"normal 0 is \(1, nan, 0\)"),
     (np.zeros((4, 3), bool), "of bool"),
     (np.zeros((4, 3), complex), "of complex128"),
     (np.zeros((4, 3), object), "of object"),

@@ -126,7 +126,7 @@ def test_to_an_accelerator_the_cloud_is_one_tile():
     given = jax.tree.map(lambda part: jax.ShapeDtypeStruct(part.shape, part.dtype), layers())
     traced = program.trace(given, jax.ShapeDtypeStruct((12_000, 64, 7), jnp.float32))
 
-    for platform in ("cpu", "cuda", "tpu"):
+    for platform in ("cpu", "cuda", "rocm", "tpu"):
         text = traced.lower(lowering_platforms=(platform,)).as_text()
         assert ("stablehlo.while" in text) == (platform == "cpu")
 

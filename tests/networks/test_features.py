@@ -32,6 +32,16 @@ def test_offsets_come_before_the_point_pair_feature(ppf, wanted):
 
 
 @pytest.mark.parametrize("ppf", ["dot", "angle"])
+def test_a_duplicate_of_a_point_lies_nowhere_from_it(ppf):
+    points, normals, neighbors = (jnp.asarray(a) for a in cloud())
+
+    found = features(jnp.tile(points[:1], (12, 1)), normals, neighbors, ppf=ppf)
+
+    there = [0, 1, 2, 3, 4, 6]  # the offset, its directions to both normals, its length
+    assert not found[..., jnp.array(there)].any() and found[..., 5].all()
+
+
+@pytest.mark.parametrize("ppf", ["dot", "angle"])
 def test_gradients_are_their_finite_differences(x64, ppf):
     points, normals, neighbors = (jnp.asarray(a) for a in cloud(1))
     rng = np.random.default_rng(2)
@@ -64,8 +74,19 @@ def test_gradients_are_finite_for_duplicates_and_parallel_or_missing_normals(ppf
         assert np.isfinite(gradient).all()
 
 
-def test_an_unknown_point_pair_feature_is_refused(unchecked):
+@pytest.mark.parametrize("name", ["cosine", "none"])
+def test_an_unknown_point_pair_feature_is_refused(unchecked, name):
     points, normals, neighbors = (jnp.asarray(a) for a in cloud())
 
-    with pytest.raises(ValueError, match="^ppf: got 'cosine'"):
-        raw_features(points, normals, neighbors, ppf="cosine")
+    with pytest.raises(ValueError, match=f"^ppf: got '{name}'"):
+        raw_features(points, normals, neighbors, ppf=name)
+
+
+def test_with_position_a_points_own_coordinates_come_first():
+    points, normals, neighbors = (jnp.asarray(a) for a in cloud(4))
+
+    found = raw_features(points, normals, neighbors, position=True)
+
+    assert found.shape == (12, 4, 10)
+    np.testing.assert_array_equal(found[..., :3], jnp.broadcast_to(points[:, None], (12, 4, 3)))
+    np.testing.assert_array_equal(found[..., 3:], raw_features(points, normals, neighbors))

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracle import pieces
+from oracle.network import annealing
 
 from cfr_jax.networks.cfr.modules import CFR, init_params
 from cfr_jax.networks.layers import group_norm, unit_rows
@@ -97,3 +98,21 @@ def test_annealing_is_positive_and_tells_the_clouds_apart(params):
     assert there.beta.shape == there.alpha.shape == (5,)
     assert (there.beta > 0).all() and (there.alpha > 0).all()
     assert np.abs(there.beta - back.beta).max() > 1e-4
+
+
+@pytest.mark.parametrize("masked", [None, "source", "target", "both"])
+def test_annealing_is_the_references_padded_or_not(params, state_dict, masked):
+    rng = np.random.default_rng(4)
+    clouds = [rng.normal(size=(n, 3)).astype(np.float32) for n in (9, 11)]
+    masks = [jnp.arange(len(cloud)) % 3 != 1 for cloud in clouds]
+    masks = [
+        m if masked in ("both", of) else None
+        for m, of in zip(masks, ("source", "target"), strict=True)
+    ]
+    network = CFR(5).bind({"params": params})
+
+    found = network.annealing(*map(jnp.asarray, clouds), *masks)
+
+    kept = [c if mask is None else c[mask] for c, mask in zip(clouds, masks, strict=True)]
+    wanted = annealing(state_dict, *kept)
+    np.testing.assert_allclose(np.concatenate(found), wanted, rtol=2e-5)

@@ -66,7 +66,7 @@ def test_an_accelerator_takes_a_large_pair_in_one_step():
     rows = jax.ShapeDtypeStruct((24_000, INPUTS), x.dtype)
     traced = slope.trace(layer, rows, jax.ShapeDtypeStruct((24_000,), bool))
 
-    for platform in ("cpu", "cuda", "tpu"):
+    for platform in ("cpu", "cuda", "rocm", "tpu"):
         text = traced.lower(lowering_platforms=(platform,)).as_text()
         assert ("stablehlo.while" in text) == (platform == "cpu")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import jax
@@ -35,6 +36,12 @@ def test_it_has_no_leaves_and_survives_what_is_done_to_parameters():
     assert uncalibrated(TREE).keys() == {"kernel"} and KEY in TREE
 
 
+def test_it_cannot_be_changed_under_a_compiled_program():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        FITTED.register = ()
+    assert hash(FITTED) == hash(Calibration.read(FITTED.write()))
+
+
 def test_gradients_and_optimizers_pass_it_by():
     # given
     def loss(tree):
@@ -64,7 +71,7 @@ GOOD = {"register": {"bias": 1.0}, "align": {"bias": 2.0}}
 @pytest.mark.parametrize(
     ("note", "told"),
     [
-        ("{", "the note is no JSON"),
+        ("{", "the note is not valid JSON"),
         ("[]", "got list, wanted register and align"),
         ('{"register": {"bias": 1}}', r"got \['register'\], wanted register and align"),
         (json.dumps(GOOD | {"align": {"fitness": 1.0}}), "align has no bias"),
@@ -81,7 +88,8 @@ def test_a_damaged_note_is_refused(note, told):
 
 def test_coefficients_of_other_clues_are_refused():
     FITTED.check("register", ["settled"])
-    with pytest.raises(ValueError, match=r"align has other clues than .*\(fitness, speed\).*anew"):
+    wanted = r"align has other clues than .*\(fitness, speed\).*fit it again"
+    with pytest.raises(ValueError, match=wanted):
         FITTED.check("align", ["speed"])
 
 

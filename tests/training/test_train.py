@@ -63,7 +63,7 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(tmp_path):
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=300)
     assert process.returncode == 130
-    assert "of 4000, all saved; the same command goes on from there" in error
+    assert "of 4000, all saved; run the same command again to resume" in error
     assert "Traceback" not in error
     saved = max(int(path.name) for path in (tmp_path / "run/checkpoints").glob("[0-9]*"))
 
@@ -73,4 +73,4 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(tmp_path):
             break
     process.kill()
     process.communicate()
-    assert line == f"going on from step {saved}\n"
+    assert line == f"resuming at step {saved}\n"

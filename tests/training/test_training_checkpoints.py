@@ -190,7 +190,7 @@ def test_a_checkpoint_of_another_network_is_told(folder):
 
     with (
         Checkpoints(folder, 5) as checkpoints,
-        pytest.raises(ValueError, match="another kind of training.*about.json"),
+        pytest.raises(ValueError, match="a different training.*about.json"),
     ):
         checkpoints.restore(other)
 
@@ -220,7 +220,7 @@ def small_files():
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_disk_that_takes_no_more_is_told_and_the_last_good_one_stays(folder, small_files):
     small_files()
-    with pytest.raises(SaveError, match="step 3 .*last good one is of step 2") as stopped:
+    with pytest.raises(SaveError, match="step 3 .*last good one is at step 2") as stopped:
         save(folder, 3)
     small_files(resource.RLIM_INFINITY)
 
@@ -240,7 +240,7 @@ def test_an_unwritable_folder_is_told_and_the_last_good_one_stays(folder):
     shutil.rmtree(folder / ".unfinished", ignore_errors=True)
     (folder / ".unfinished").write_text("a file")
 
-    with pytest.raises(SaveError, match="step 3 .*could not be written; .*good one is of step 2"):
+    with pytest.raises(SaveError, match="step 3 .*could not be written; .*good one is at step 2"):
         save(folder, 3)
 
     assert_is(restore(folder), 2)

@@ -139,7 +139,7 @@ def test_processes_of_unequal_devices_are_refused(monkeypatch):
     mesh = devices.make_mesh()
     monkeypatch.setattr(jax, "process_count", lambda: 2)  # the other one would have none
 
-    with pytest.raises(ValueError, match="processes: .*wanted as many in each"):
+    with pytest.raises(ValueError, match="processes: .*wanted equally many in each process"):
         devices.check_batch(4 * mesh.size, 1, mesh)
 
 

@@ -16,7 +16,7 @@ from training_samples import assert_same
 
 from cfr_jax.training.checkpoints import Checkpoints
 from cfr_jax.training.config import Phase
-from cfr_jax.weights import files as weights
+from cfr_jax.weights.files import load_params
 
 HERE = Path(__file__).parent
 KILLS = 4
@@ -69,7 +69,7 @@ def test_a_run_killed_at_random_moments_ends_bit_equal(tmp_path):
     assert int(first.step) == 60
     assert_same(first, second)
     assert about["best"] == told["best"] and about["position"] == told["position"]
-    assert_same(*(weights.load_params(f / "weights.safetensors") for f in (whole, killed)))
+    assert_same(*(load_params(f / "weights.safetensors") for f in (whole, killed)))
     assert steps_told(killed) == steps_told(whole)
 
 

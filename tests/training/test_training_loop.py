@@ -28,7 +28,7 @@ from cfr_jax.training.reporting.board import Board
 from cfr_jax.training.reporting.reporter import Reporter
 from cfr_jax.training.stopping import Stopped
 from cfr_jax.training.task import fresh_params, prepare
-from cfr_jax.weights import files as weights
+from cfr_jax.weights.files import load_params, read_weights
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_an_interrupted_run_resumes_bit_for_bit(corpus_file, tmp_path, whole, ki
     assert int(first.step) == 16
     assert_same(first, second)
     files = (folder / "weights.safetensors" for folder in (whole[0], tmp_path))
-    assert_same(*(weights.load_params(file) for file in files))
+    assert_same(*(load_params(file) for file in files))
     for one, other in zip(lines_of(whole[0]), lines_of(tmp_path), strict=True):
         assert one["step"] == other["step"]
         assert one.get("loss") == other.get("loss")
@@ -128,7 +128,7 @@ def test_the_weights_are_those_that_the_newest_checkpoint_calls_best(
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(weights, "save_params", killed)
+        patch.setattr(loop, "save_params", killed)
         with pytest.raises(Killed):
             run(config(corpus_file), tmp_path)
     assert not (tmp_path / "weights.safetensors").exists()
@@ -139,7 +139,7 @@ def test_the_weights_are_those_that_the_newest_checkpoint_calls_best(
     best = run(given, tmp_path)  # nothing is left to do but this
 
     assert best["step"] == 4
-    made = weights.load_params(tmp_path / "weights.safetensors")
+    made = load_params(tmp_path / "weights.safetensors")
     assert_same(made, state_of(tmp_path).average)
 
 
@@ -173,7 +173,7 @@ def test_a_run_leaves_its_measurements_its_weights_and_a_page(whole):
     measured = {line["step"]: line["validation"] for line in lines if "validation" in line}
     assert list(measured) == [4, 8, 12, 16]
     assert best["rotation_mean"] == min(found["rotation_mean"] for found in measured.values())
-    made = weights.read_weights(folder / "weights.safetensors")
+    made = read_weights(folder / "weights.safetensors")
     assert json.loads(made.notes["validation"]) == best
     assert json.loads(made.notes["config"])["validate_every"] == 4
     page = (folder / "summary.html").read_text()
@@ -200,7 +200,7 @@ def test_another_config_goes_on_with_a_word(killed_config, tmp_path, capsys):
     run(changed, tmp_path)
 
     told = capsys.readouterr().out
-    assert "going on from step 4" in told and "keep_checkpoints 2 → 3" in told
+    assert "resuming at step 4" in told and "keep_checkpoints 2 → 3" in told
     assert int(state_of(tmp_path).step) == 16
 
 
@@ -213,7 +213,7 @@ def test_a_run_from_before_phases_had_samplings_goes_on_without_a_word(corpus_fi
 
     told = identity.go_on(before, now, 16, tmp_path)
 
-    assert told == ["going on from step 4"] and now["step"] == 4
+    assert told == ["resuming at step 4"] and now["step"] == 4
 
 
 def test_a_workdir_of_other_training_data_is_refused(tmp_path, whole):
@@ -295,7 +295,7 @@ def test_weights_to_start_from_are_measured_first_and_kept_if_no_better_come(
 
     def worse_every_time(chosen, params, *others):
         same = np.array_equal(
-            params["features"]["kernel_1"], weights.load_params(begun)["features"]["kernel_1"]
+            params["features"]["kernel_1"], load_params(begun)["features"]["kernel_1"]
         )
         return found(chosen, params, *others) | {"rotation_mean": 1.0 + (not same)}
 
@@ -304,7 +304,7 @@ def test_weights_to_start_from_are_measured_first_and_kept_if_no_better_come(
 
     assert best["step"] == 0 and best["rotation_mean"] == 1.0
     assert [line["step"] for line in lines_of(tmp_path) if "validation" in line][0] == 0
-    assert_same(weights.load_params(tmp_path / "weights.safetensors"), weights.load_params(begun))
+    assert_same(load_params(tmp_path / "weights.safetensors"), load_params(begun))
 
 
 def test_gradients_that_stay_infinite_stop_the_run(corpus_file, tmp_path, monkeypatch):
@@ -352,7 +352,7 @@ def test_answers_that_are_no_numbers_are_no_validation(monkeypatch):
     monkeypatch.setattr(step, "predict", lambda *_, **__: jax.numpy.asarray(found))
     chosen = learner.learner(config("nowhere.h5"))
 
-    with pytest.raises(stopping.Diverged, match="answers to 1 of 3 validation pairs"):
+    with pytest.raises(stopping.Diverged, match="answers of the weights to 1 of 3 validation"):
         validation.validate(chosen, {}, {}, found[:, 0], devices.make_mesh())
 
 
@@ -388,7 +388,7 @@ def test_a_run_cut_short_before_its_first_validation_is_validated(
 
     best = run(given, tmp_path)
 
-    made = weights.read_weights(tmp_path / "weights.safetensors")
+    made = read_weights(tmp_path / "weights.safetensors")
     assert best["step"] == 4 and json.loads(made.notes["validation"]) == best
 
 
@@ -414,7 +414,7 @@ def test_weights_to_start_from_have_the_iterations_that_are_asked_for(corpus_fil
     given = config(corpus_file)
     given.train.start_from, given.iterations = str(whole[0] / "weights.safetensors"), 2
 
-    with pytest.raises(ValueError, match="start_from: .*other iterations than .*iterations = 2"):
+    with pytest.raises(ValueError, match="start_from: .*was not made with .*iterations = 2"):
         fresh_params(given, learner.learner(given))
 
 
@@ -446,7 +446,7 @@ def test_a_full_disk_stops_the_run_and_loses_nothing(corpus_file, tmp_path, monk
     monkeypatch.setattr(Board, "close", closed_in_vain)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Checkpoints, "_finish", full_after_step_8)
-        with pytest.raises(SaveError, match="step 12 .*\n?.*last good one is of step 8") as stopped:
+        with pytest.raises(SaveError, match="step 12 .*\n?.*last good one is at step 8") as stopped:
             run(given, tmp_path)
     assert "No space left" in str(stopped.value) and "same command" in str(stopped.value)
     monkeypatch.undo()

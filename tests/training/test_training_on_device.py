@@ -23,7 +23,7 @@ from cfr_jax.training.config import Phase, TrainSection
 from cfr_jax.training.drawing import Leg
 from cfr_jax.training.drawing.device import DeviceDrawing
 from cfr_jax.training.reporting.reporter import Reporter
-from cfr_jax.weights import files as weights
+from cfr_jax.weights.files import read_weights
 
 STEPS_AT_ONCE = 4
 SAMPLING = Sampling(points=POINTS, neighbors=NEIGHBORS, estimated_normals=0.5)
@@ -125,7 +125,7 @@ def test_a_run_logs_validates_and_saves_at_the_steps_asked_for(whole):
     assert int(state_of(folder).step) == 16
     about = json.loads((folder / "checkpoints/16/about.json").read_text())
     assert about["position"] == 16 * BATCH
-    made = weights.read_weights(folder / "weights.safetensors")
+    made = read_weights(folder / "weights.safetensors")
     assert json.loads(made.notes["validation"]) == best
 
 
@@ -244,7 +244,8 @@ def test_bfloat16_is_of_cfr_alone(corpus_file, tmp_path):
     given = config(corpus_file, precision="bfloat16")
     given.network = "rpmnet"
 
-    with pytest.raises(ValueError, match="precision: got 'bfloat16', which rpmnet does not have"):
+    wanted = "precision: got 'bfloat16', which rpmnet does not support"
+    with pytest.raises(ValueError, match=wanted):
         run(given, tmp_path)
 
 

@@ -212,7 +212,7 @@ def test_without_tensorboardx_a_word_is_said_and_training_goes_on(tmp_path, monk
     silent.validation(2, {}, [])
     silent.close()
 
-    assert silent.missing == 'no TensorBoard files: pip install "cfr_jax[train]" to have them'
+    assert silent.missing == 'no TensorBoard files: to get them, pip install "cfr_jax[train]"'
     assert not (tmp_path / "tensorboard").exists()
 
 

@@ -144,7 +144,11 @@ def products(jaxpr):
     precise."""
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
-            files = [frame.file_name for frame in equation.source_info.traceback.frames]
+            frames = equation.source_info.traceback.frames
+            # what a GPU multiplies in halves is not rounded: test_sinkhorn
+            if "by_halves" in {frame.function_name for frame in frames}:
+                continue
+            files = [frame.file_name for frame in frames]
             here = next(file for file in files if "/cfr_jax/" in file or "/flax/linen/" in file)
             room = (
                 re.split("/cfr_jax/|/flax/linen/", here)[-1].removeprefix("networks/").split("/")[0]

@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax.traverse_util import unflatten_dict
+from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors.numpy import load_file, save_file
 
 from cfr_jax.networks import rpmnet
 from cfr_jax.networks.cfr.modules import init_params
 from cfr_jax.networks.probability import KEY, Calibration, calibration_of
-from cfr_jax.weights import files as weights
+from cfr_jax.weights.files import load_params, network_of, read_weights, save_params, shipped
 
 
 @pytest.fixture(scope="module")
@@ -23,12 +23,12 @@ def fresh():
 @pytest.fixture
 def saved(fresh, tmp_path):
     path = tmp_path / "mine.safetensors"
-    weights.save_params(path, fresh, {"made_by": "a test", "corpus": "none"})
+    save_params(path, fresh, {"made_by": "a test", "corpus": "none"})
     return path
 
 
 def test_what_is_saved_comes_back_with_its_notes(fresh, saved):
-    found = weights.read_weights(saved)
+    found = read_weights(saved)
 
     assert jax.tree.structure(found.params) == jax.tree.structure(fresh)
     for a, b in zip(jax.tree.leaves(found.params), jax.tree.leaves(fresh), strict=True):
@@ -36,70 +36,73 @@ def test_what_is_saved_comes_back_with_its_notes(fresh, saved):
         np.testing.assert_array_equal(a, b)
     assert found.notes == {"made_by": "a test", "corpus": "none"}
     assert found.name == "mine" and len(found.sha256) == 64
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, weights.load_params(str(saved)), fresh))
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, load_params(str(saved)), fresh))
     assert [path.name for path in saved.parent.iterdir()] == ["mine.safetensors"]
 
 
 def test_the_calibration_comes_back_with_the_weights(fresh, tmp_path):
     # given weights of ours with the calibration of others
     path = tmp_path / "calibrated.safetensors"
-    fitted = calibration_of(weights.load_params("object"))
-    weights.save_params(path, {**fresh, KEY: fitted}, {"made_by": "a test"})
+    fitted = calibration_of(load_params("object"))
+    save_params(path, {**fresh, KEY: fitted}, {"made_by": "a test"})
 
     # when
-    found = weights.read_weights(path)
+    found = read_weights(path)
 
     # then
     assert calibration_of(found.params) == fitted and found.notes == {"made_by": "a test"}
     assert jax.tree.leaves(found.params)[0].dtype == jnp.float32
-    weights.save_params(tmp_path / "again.safetensors", found.params, found.notes)
-    assert weights.read_weights(tmp_path / "again.safetensors").sha256 == found.sha256
+    save_params(tmp_path / "again.safetensors", found.params, found.notes)
+    assert read_weights(tmp_path / "again.safetensors").sha256 == found.sha256
     # other coefficients give another digest, and weights without coefficients have none
-    weights.save_params(path, fresh, {"made_by": "a test"})
-    bare = weights.read_weights(path)
+    save_params(path, fresh, {"made_by": "a test"})
+    bare = read_weights(path)
     assert calibration_of(bare.params) is None and bare.sha256 != found.sha256
 
 
 @pytest.mark.parametrize(
     ("fitted", "told"),
     [
-        ("nonsense", "the note is no JSON"),
-        ('{"register": {"bias": 1}, "align": {"bias": 1}}', "register has other clues than are"),
+        ("nonsense", "the note is not valid JSON"),
+        (
+            '{"register": {"bias": 1}, "align": {"bias": 1}}',
+            "register has other clues than this version",
+        ),
     ],
 )
 def test_a_damaged_calibration_is_refused(fresh, tmp_path, monkeypatch, fitted, told):
     # given a file whose digest matches, because it was written with that note
     monkeypatch.setattr(Calibration, "write", lambda _: fitted)
     path = tmp_path / "damaged.safetensors"
-    weights.save_params(path, {**fresh, KEY: Calibration.of({"bias": 0.0}, {"bias": 0.0})})
+    save_params(path, {**fresh, KEY: Calibration.of({"bias": 0.0}, {"bias": 0.0})})
 
     with pytest.raises(ValueError, match=f"^weights: .*damaged.safetensors: calibration: {told}"):
-        weights.read_weights(path)
+        read_weights(path)
 
 
 @pytest.mark.parametrize("name", [KEY, "sha256"])
 def test_reserved_names_of_notes_are_refused(fresh, tmp_path, name):
     with pytest.raises(ValueError, match=f"notes: got the reserved name '{name}'"):
-        weights.save_params(tmp_path / "w.safetensors", fresh, {name: "{}"})
+        save_params(tmp_path / "w.safetensors", fresh, {name: "{}"})
     assert not list(tmp_path.iterdir())
 
 
 def test_tensors_of_no_network_are_refused(tmp_path):
     path = tmp_path / "other.safetensors"
-    weights.save_params(path, {"nobody": np.zeros(3, np.float32)})
-    with pytest.raises(ValueError, match="other.*no network that is known .* tensors: nobody"):
-        weights.read_weights(path)
+    save_params(path, {"nobody": np.zeros(3, np.float32)})
+    with pytest.raises(ValueError, match="other.*no known network .* tensors: nobody"):
+        read_weights(path)
 
 
 def test_weights_have_the_same_digest_only_if_they_are_equal(fresh, saved, tmp_path):
     other = tmp_path / "other.safetensors"
-    digest = weights.read_weights(saved).sha256
+    digest = read_weights(saved).sha256
 
-    weights.save_params(other, fresh, {"corpus": "none", "made_by": "a test"})
-    assert weights.read_weights(other).sha256 == digest
+    save_params(other, fresh, {"corpus": "none", "made_by": "a test"})
+    assert read_weights(other).sha256 == digest
 
-    weights.save_params(other, jax.tree.map(lambda leaf: leaf * 2, fresh), {"made_by": "a test"})
-    assert weights.read_weights(other).sha256 != digest
+    save_params(other, jax.tree.map(lambda leaf: leaf * 2, fresh), {"made_by": "a test"})
+    assert read_weights(other).sha256 != digest
 
 
 def test_any_flipped_bit_is_noticed(saved):
@@ -113,11 +116,11 @@ def test_any_flipped_bit_is_noticed(saved):
         content[place] ^= bit
         saved.write_bytes(content)
         with pytest.raises(ValueError, match="^weights: "):
-            weights.read_weights(saved)
+            read_weights(saved)
         content[place] ^= bit
 
     saved.write_bytes(content)
-    weights.read_weights(saved)
+    read_weights(saved)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.9999])
@@ -126,7 +129,7 @@ def test_a_truncated_file_is_refused(saved, share):
     saved.write_bytes(content[: int(share * len(content))])
 
     with pytest.raises(ValueError, match="is not a readable safetensors file"):
-        weights.read_weights(saved)
+        read_weights(saved)
 
 
 @pytest.mark.parametrize(
@@ -141,33 +144,31 @@ def test_a_truncated_file_is_refused(saved, share):
 def test_another_network_is_refused(fresh, tmp_path, change, told):
     tree = jax.tree.map(np.asarray, fresh)
     change(tree)
-    weights.save_params(tmp_path / "other.safetensors", tree)
+    save_params(tmp_path / "other.safetensors", tree)
 
     with pytest.raises(ValueError, match=f"^weights: .*{told}"):
-        weights.read_weights(tmp_path / "other.safetensors")
+        read_weights(tmp_path / "other.safetensors")
 
 
 def test_a_file_knows_which_network_it_holds(fresh, saved, tmp_path):
     # given weights of the two networks
     other = tmp_path / "other.safetensors"
-    weights.save_params(other, jax.jit(rpmnet.init_params)(jax.random.key(0)))
+    save_params(other, jax.jit(rpmnet.init_params)(jax.random.key(0)))
 
     # then each is read for what it is
-    assert weights.read_weights(saved).network == weights.network_of(fresh) == "cfr"
-    assert weights.read_weights(other).network == "rpmnet"
-    assert weights.network_of(weights.load_params(other, "rpmnet")) == "rpmnet"
+    assert read_weights(saved).network == network_of(fresh) == "cfr"
+    assert read_weights(other).network == "rpmnet"
+    assert network_of(load_params(other, "rpmnet")) == "rpmnet"
     with pytest.raises(ValueError, match="other.* holds the network RPM-Net, wanted CFR$"):
-        weights.load_params(other)
+        load_params(other)
     with pytest.raises(ValueError, match="mine.* holds the network CFR, wanted RPM-Net$"):
-        weights.load_params(saved, "rpmnet")
+        load_params(saved, "rpmnet")
 
 
 def test_weights_with_a_shared_layer_come_back(tmp_path):
     path = tmp_path / "shared.safetensors"
-    weights.save_params(
-        path, jax.jit(init_params, static_argnums=(1, 2))(jax.random.key(0), 3, True)
-    )
-    assert weights.load_params(path)["cascade"]["kernel"].shape == (1, 96, 96)
+    save_params(path, jax.jit(init_params, static_argnums=(1, 2))(jax.random.key(0), 3, True))
+    assert load_params(path)["cascade"]["kernel"].shape == (1, 96, 96)
 
 
 def test_a_file_of_someone_else_is_refused(saved, tmp_path):
@@ -175,27 +176,27 @@ def test_a_file_of_someone_else_is_refused(saved, tmp_path):
     save_file(load_file(saved), path)
 
     with pytest.raises(ValueError, match="has no digest, so cfr_jax did not write it"):
-        weights.read_weights(path)
+        read_weights(path)
 
 
 def test_an_unknown_name_is_answered_with_the_shipped_names():
     with pytest.raises(ValueError, match="no file and no shipped weights called 'nowhere'"):
-        weights.read_weights("nowhere")
+        read_weights("nowhere")
 
 
 def test_a_failed_save_leaves_nothing_behind(saved):
     before = saved.read_bytes()
 
     with pytest.raises(Exception, match="."):
-        weights.save_params(saved, {"a": object()})
+        save_params(saved, {"a": object()})
 
     assert saved.read_bytes() == before
     assert [path.name for path in saved.parent.iterdir()] == ["mine.safetensors"]
 
 
 def test_every_shipped_file_is_sound():
-    for name in weights.shipped():
-        found = weights.read_weights(name)
+    for name in shipped():
+        found = read_weights(name)
 
         assert found.name == name
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found.params))
@@ -204,25 +205,25 @@ def test_every_shipped_file_is_sound():
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_numbers_that_are_not_finite_are_refused_with_the_right_digest(fresh, tmp_path, value):
     # given
-    names = sorted(weights._flat(fresh))
+    names = sorted(flatten_dict(fresh, sep="/"))
     path = tmp_path / "poisoned.safetensors"
     for name in names[:: len(names) // 5]:
-        flat = {key: np.array(leaf) for key, leaf in weights._flat(fresh).items()}
+        flat = {key: np.array(leaf) for key, leaf in flatten_dict(fresh, sep="/").items()}
         flat[name].flat[-1] = value
         tree = unflatten_dict(flat, sep="/")
-        weights.save_params(path, tree)
+        save_params(path, tree)
 
         # when, then
         with pytest.raises(ValueError, match=f"poisoned.*: {name} holds a number that is not fin"):
-            weights.read_weights(path)
+            read_weights(path)
 
 
 def test_a_bias_that_claims_a_million_iterations_is_refused_before_it_is_traced(fresh, tmp_path):
     tree = jax.tree.map(np.asarray, fresh)
     tree["annealing"]["out"]["bias"] = np.zeros(4 << 20, np.float32)
-    weights.save_params(tmp_path / "long.safetensors", tree)
+    save_params(tmp_path / "long.safetensors", tree)
     with pytest.raises(ValueError, match="for 2,097,152 iterations, wanted at most 100"):
-        weights.read_weights(tmp_path / "long.safetensors")
+        read_weights(tmp_path / "long.safetensors")
 
 
 def _with_type(path, kind, size):
@@ -243,12 +244,12 @@ def test_tensors_of_any_type_are_refused_in_words(kind, size, tmp_path):
     path = tmp_path / "typed.safetensors"
     _with_type(path, kind, size)
     with pytest.raises(ValueError, match="^weights: .*typed.safetensors") as caught:
-        weights.read_weights(path)
+        read_weights(path)
     assert len(str(caught.value)) <= 600
 
 
 @pytest.mark.parametrize("name", ["", "no\0thing", "x" * 5000, "/dev/null", "/"])
 def test_a_path_that_is_no_file_of_weights_is_refused(name):
     with pytest.raises(ValueError, match="^weights: ") as caught:
-        weights.read_weights(name)
+        read_weights(name)
     assert len(str(caught.value)) <= 600

@@ -1,4 +1,4 @@
-"""Compiled programs kept between calls: compiling takes seconds, registering a fraction of one."""
+"""Keeps compiled programs between calls: compiling takes seconds, registering less than one."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from cfr_jax.runtime.words import Refused
 
 
 def keep_compiled_programs() -> None:
-    """Turns JAX's compilation cache on, in the user's cache folder.
+    """Turns on JAX's compilation cache, in the user's cache folder.
 
-    `CFR_JAX_CACHE` names another folder, or is "off". A cache that JAX was already told of
-    (`JAX_COMPILATION_CACHE_DIR`) stays as it is. Without a folder to write to, calls are slower
-    and nothing else. A folder that is another user's, or that others may write into, is not used,
-    and standard error says so: whoever can write there could give any answer.
+    `CFR_JAX_CACHE` names another folder, or is "off". If JAX already has a cache
+    (`JAX_COMPILATION_CACHE_DIR`), it stays as it is. Without a writable folder, calls are only
+    slower. A folder that belongs to another user, or that others may write into, is not used, and
+    standard error says so: whoever can write there could give any answer.
     """
     import jax
 
@@ -38,11 +38,11 @@ def keep_compiled_programs() -> None:
         return
     if not os.access(folder, os.W_OK):
         return
-    # A damaged or unwritable entry only costs time, which the JSON tells.
+    # A damaged or unwritable entry only costs time, and the JSON report shows the time.
     warnings.filterwarnings("ignore", message=".*persistent compilation cache")
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-    # imported here: it takes JAX along
+    # imported here because it imports JAX
     from cfr_jax.runtime import programs
 
     programs.keep_in(folder)

@@ -1,4 +1,4 @@
-"""Programs whose settings are a config file, of which any field can be set on the command line."""
+"""Programs that read a config file and let flags set any of its fields."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 from absl import app
 
 _MISTAKES = (AttributeError, IndexError, KeyError, SyntaxError, TypeError, ValueError)
-# how ml_collections names a field that a dataclass does not have
+# how ml_collections reports a field that a dataclass does not have
 _UNKNOWN = (
     re.compile(r"Field (?P<name>\S+) not found on dataclass <class '(?P<section>\S+)'>"),
     re.compile(r"Attribute <class '(?P<section>\S+)'>\.(?P<name>\S+) does not exist"),
@@ -22,19 +22,19 @@ _UNKNOWN = (
 
 
 def run(main: Callable[[Sequence[str]], None]) -> None:
-    """`absl.app.run`, with a few lines instead of a traceback for a flag that cannot be used."""
+    """`absl.app.run`, but a flag that cannot be used gives a few lines instead of a traceback."""
     app.run(main, flags_parser=_parse)
 
 
 def _parse(arguments: Sequence[str]) -> Sequence[str]:
     try:
         return app.parse_flags_with_usage(list(arguments))
-    except _MISTAKES as error:  # whatever a config file or ml_collections makes of a field
+    except _MISTAKES as error:  # whatever a config file or ml_collections raises
         raise SystemExit(
             f"{Path(sys.argv[0]).name}: error: a field of the config cannot be set like this: "
             f"{_in_words(error)}\n"
-            "Write a field as --config.train.peak_rate=3e-4, and one of a list by its place: "
-            "'--config.phases[0].steps=20'"
+            "Write a field as --config.train.peak_rate=3e-4, and an item of a list by its "
+            "position: '--config.phases[0].steps=20'"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Whole numbers as arguments, refused in words."""
+"""Whole numbers as arguments, with clear error messages."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import argparse
 
 
 def positive(text: str) -> int:
-    """A whole number of at least 1."""
+    """The text as a whole number of at least 1; raises ArgumentTypeError for anything else."""
     return _whole(text, 1)
 
 
 def not_negative(text: str) -> int:
-    """A whole number of at least 0."""
+    """The text as a whole number of at least 0; raises ArgumentTypeError for anything else."""
     return _whole(text, 0)
 
 

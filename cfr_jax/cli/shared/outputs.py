@@ -1,4 +1,4 @@
-"""Files that a command will write: known to be writable before it computes anything."""
+"""The output files of a command: checked before it computes anything, and drawn."""
 
 from __future__ import annotations
 
@@ -20,23 +20,25 @@ RECORDING_SUFFIXES = (".rrd",)
 
 
 def cloud_suffixes() -> tuple[str, ...]:
-    """What `cfr_jax.io.write` writes."""
+    """The suffixes of files that `cfr_jax.io.write` can write."""
     return tuple(formats.by_suffix(formats.writable()))
 
 
 def check_output(option: str, path: Path, suffixes: tuple[str, ...] = ()) -> None:
-    """Raises ValueError, naming the option, if `path` has none of the suffixes or its folder
-    takes no new file. Leaves no trace.
+    """Raises a ValueError that names the option if `path` cannot be written.
+
+    `path` must have one of the suffixes, and its folder must accept new files. The check leaves no
+    trace.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise ValueError(f"{option}: got {path}, wanted a name that ends in {' '.join(suffixes)}")
     if path.exists() and not path.is_file():  # a rename would replace even a device
-        kind = "a folder" if path.is_dir() else "no regular file"
+        kind = "a folder" if path.is_dir() else "not a regular file"
         raise ValueError(f"{option}: {path} is {kind}, wanted a file to write")
     if not path.parent.is_dir():
         raise ValueError(f"{option}: there is no folder {path.parent} to write {path.name} into")
     try:
-        # Asking for permissions tells little (root, read-only mounts): try.
+        # Permissions say little (root, read-only mounts), so try to write.
         tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:
         raise ValueError(
@@ -50,7 +52,7 @@ def check_apart(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
     for path in outputs:
         place = os.path.realpath(path)
         if place in taken:
-            raise ValueError(f"{path} would be written over: it is an input, or written twice")
+            raise ValueError(f"{path} would be overwritten: it is an input, or is written twice")
         taken.add(place)
 
 
@@ -60,7 +62,7 @@ def can_draw() -> bool:
 
 
 def check_library(option: str, path: Path) -> None:
-    """Raises ValueError, naming the option and the extra, if what draws such a file is missing."""
+    """Raises a ValueError that names the option and what to install if `path` cannot be drawn."""
     suffix = path.suffix.lower()
     if suffix in PICTURE_SUFFIXES and not can_draw():
         raise ValueError(f'{option}: pictures need matplotlib: pip install "cfr_jax[viz]"')
@@ -69,7 +71,7 @@ def check_library(option: str, path: Path) -> None:
 
 
 def draw(scene: Scene, paths: Iterable[Path]) -> None:
-    """Draws `scene` into each file, the form told by the suffix."""
+    """Draws `scene` into each file; the suffix decides between picture, recording and page."""
     from cfr_jax import viewer
 
     for path in paths:

@@ -1,4 +1,4 @@
-"""A registration with what it came from, and its three forms: text, JSON document, scene."""
+"""A registration with its inputs, and its three forms: text, JSON document, scene."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FORMAT = "cfr_jax/register/1"
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What went in and what came out."""
+    """The inputs of a registration and its result."""
 
     source: PointCloud
     target: PointCloud
@@ -34,10 +34,20 @@ class Result:
     alignment: Alignment
 
     def moved_source(self) -> PointCloud:
-        """The whole source, laid on the target."""
-        transform, normals = self.alignment.transform, self.source.normals
-        normals = None if normals is None else motions.rotate(transform, normals)
-        return PointCloud(motions.apply(transform, self.source.points), normals, self.source.name)
+        """The whole source, moved onto the target, with all columns that it was read with."""
+        transform, source = self.alignment.transform, self.source
+
+        def turned(normals: np.ndarray | None) -> np.ndarray | None:
+            return None if normals is None else motions.rotate(transform, normals)
+
+        table = source.table
+        if table is not None:
+            with np.errstate(invalid="ignore"):  # rows without a point are infinite or NaN
+                table = table.moved(
+                    motions.apply(transform, table.points()), turned(table.normals())
+                )
+        points = motions.apply(transform, source.points)
+        return PointCloud(points, turned(source.normals), source.name, table=table)
 
 
 def register(
@@ -48,11 +58,11 @@ def register(
     refine: bool | str = True,
     initial: Initial = None,
     max_points: int | None = None,
-    all_points: bool = False,
+    all_points: bool = True,
     second_look: bool = True,
     seed: int = 0,
 ) -> Result:
-    """`align` with weights by name or path; raises ValueError as `align` and `read_weights` do."""
+    """`align` with weights by name or path; raises ValueError like `align` and `read_weights`."""
     chosen = read_weights(DEFAULT if weights is None else weights, "cfr")
     alignment = align(
         source,
@@ -69,7 +79,7 @@ def register(
 
 
 def as_document(result: Result, source_path: str, target_path: str) -> dict[str, Any]:
-    """Everything that is known, as `register.schema.json` describes it."""
+    """Everything that is known about a result, in the form of `register.schema.json`."""
     found = result.alignment
     return {
         "format": FORMAT,
@@ -123,8 +133,10 @@ def as_text(result: Result) -> str:
 
 
 def quality(found: Any) -> dict[str, str]:
-    """The figures a reader judges by, of an `Alignment` or of what has the same ones, written
-    out."""
+    """The figures by which a reader judges a result, in words.
+
+    `found` is an `Alignment`, or anything with the same attributes.
+    """
     return {
         "confidence": "unknown" if found.confidence is None else f"{found.confidence:.2f}",
         "fitness": f"{found.fitness:.3f} of the source within {found.inlier_distance:.4g}",
@@ -134,7 +146,7 @@ def quality(found: Any) -> dict[str, str]:
 
 
 def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
-    """The way from the start to the answer, with `facts` before the figures of quality."""
+    """The motion from the start to the answer, with `facts` shown before the quality."""
     found = result.alignment
     stations, labels = way(
         result.initial, found.transforms, found.transform if found.refined else None
@@ -157,7 +169,7 @@ def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
 def way(
     initial: ArrayLike | None, transforms: Iterable[ArrayLike], refined: ArrayLike | None
 ) -> tuple[list[Any], list[str]]:
-    """The stations of the motion, each (4, 4), and what they are called."""
+    """The stations of the motion, each (4, 4), and their labels."""
     stations = [np.eye(4) if initial is None else initial, *transforms]
     labels = ["start", *(f"iteration {i}" for i in range(1, len(stations)))]
     if refined is not None:
@@ -171,9 +183,10 @@ def _cloud(cloud: PointCloud, path: str, used: int) -> dict[str, Any]:
 
 
 def _counts(cloud: PointCloud, used: int) -> str:
-    return f"{len(cloud):,} points, {used:,} used"
+    empty = f", {cloud.left_out:,} rows without a point left out" if cloud.left_out else ""
+    return f"{len(cloud):,} points, {used:,} used{empty}"
 
 
 def _row(row: Float64[np.ndarray, " 4"]) -> str:
-    # Twelve digits: a millimeter at map coordinates, and more than a rotation needs.
+    # Twelve digits resolve a millimeter at map coordinates, and are more than a rotation needs.
     return " ".join(f"{value:17.12g}" for value in row)

@@ -58,7 +58,10 @@ def _check_cloud(role: str, about: Any) -> None:
     if not isinstance(about, dict):
         raise Refused(f'has no usable "{role}"')
     if not isinstance(about.get("path"), str) or "\0" in about["path"]:
-        raise Refused(f'does not say where its "{role}" lies')
+        raise Refused(f'does not say where its "{role}" is')
+    columns = about.get("columns", [])
+    if not isinstance(columns, list) or not all(isinstance(name, str) for name in columns):
+        raise Refused(f'the "columns" of its "{role}" are not names')
     if not _is_count(about.get("points", 1)):
         raise Refused(f'does not say how many points its "{role}" has')
 
@@ -117,20 +120,23 @@ def find_cloud(document: dict[str, Any], role: str, result: Path, given: Path | 
         if os.path.exists(place):
             return place
     raise Refused(
-        f"{role}: {shown(noted)}, which {shown(result.name)} is about, is not there any more, "
-        f"nor beside it; --{role} FILE says where it lies now"
+        f"{role}: {shown(noted)}, which {shown(result.name)} was made from, does not exist, nor does a "
+        f"file of that name beside the result; give --{role} FILE to say where it is now"
     )
 
 
 def read_clouds(document: dict[str, Any], paths: dict[str, Path]) -> dict[str, PointCloud]:
     """The two clouds, sampled as they were; ValueError if one has other points than it had."""
-    clouds = {role: io.read(path, seed=document["seed"]) for role, path in paths.items()}
+    clouds = {
+        role: io.read(path, seed=document["seed"], columns=document[role].get("columns"))
+        for role, path in paths.items()
+    }
     for role, cloud in clouds.items():
         had = document[role].get("points", len(cloud))
         if len(cloud) != had:
             raise Refused(
-                f"{role}: {shown(paths[role])} has {len(cloud):,} points, the result is about "
-                f"{had:,}: another file? --{role} FILE names the right one"
+                f"{role}: {shown(paths[role])} has {len(cloud):,} points, but the result was "
+                f"made from {had:,}; give --{role} FILE if it is a different file"
             )
     return clouds
 
@@ -165,6 +171,6 @@ def _doubts(document: dict[str, Any], source: PointCloud, target: PointCloud) ->
     fitness = float((away <= document["inlier_distance"]).mean())
     if fitness < document["fitness"] - _WORSE:
         yield (
-            f"the clouds do not fit as they did (fitness {fitness:.2f}, and it was "
+            f"the clouds do not fit as they did before (fitness {fitness:.2f}; it was "
             f"{document['fitness']:.2f}): were the files changed?"
         )

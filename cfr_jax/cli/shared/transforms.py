@@ -1,4 +1,4 @@
-"""A 4x4 transform from a file."""
+"""Reads a 4x4 transform from a file."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _parse_json(data: bytes) -> np.ndarray:
     value = parse_json(data)
     if isinstance(value, dict):
         if "transform" not in value:
-            raise Refused('holds no "transform"')
+            raise Refused('has no "transform"')
         value = value["transform"]
     if isinstance(value, list) and len(value) == 16:
         value = [value[row : row + 4] for row in range(0, 16, 4)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -32,7 +33,7 @@ class Comparison:
     distance: dict[str, float]  # mean distance to the nearest point, quantiles over shapes
     normals: dict[str, float]  # mean |cosine| between normals of nearest points, quantiles
 
-    def asdict(self) -> dict:
+    def asdict(self) -> dict[str, Any]:
         return asdict(self)
 
     def __str__(self) -> str:

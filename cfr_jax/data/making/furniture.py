@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cfr_jax.io.formats.surfaces import parse_obj
+from cfr_jax.io.formats.meshes.surfaces import parse_obj
 from cfr_jax.io.mesh import Mesh
 
 CATALOG = "PluginFurnitureCatalog.properties"
@@ -56,7 +56,7 @@ class FurnitureLibrary:
             text = self._zip.read(CATALOG).decode("latin1")
         except (OSError, zipfile.BadZipFile, KeyError) as error:
             raise ValueError(f"{path} is not a furniture library (SH3F): {error}") from error
-        self.pieces = _pieces(text, path)
+        self.pieces: tuple[Piece, ...] = _pieces(text, path)
 
     def __enter__(self) -> FurnitureLibrary:
         return self
@@ -66,7 +66,10 @@ class FurnitureLibrary:
 
     def mesh(self, piece: Piece) -> Mesh:
         """The model of a piece, in the units of its file (see `Piece.scaled`)."""
-        return parse_obj(_model(self._zip, piece.model, self.path), piece.identifier)
+        shape = parse_obj(_model(self._zip, piece.model, self.path), piece.identifier)
+        if not isinstance(shape, Mesh):
+            raise ValueError(f"{piece.identifier}: has no faces, wanted a mesh")
+        return shape
 
 
 def _pieces(text: str, path: Path) -> tuple[Piece, ...]:

@@ -1,10 +1,11 @@
-"""Peers to compare with: one file each, and one signature for all.
+"""Other methods to compare with: one file each, and the same signature for all.
 
     register(source: PointCloud, target: PointCloud, **options) -> (4, 4) float64
 
 The answer maps source onto target. Lengths among the options are in the unit of the clouds, and
 have no defaults: what suits a chair does not suit a street. A method that finds no motion raises
-`NoMotion`; one whose library is not installed raises `ModuleNotFoundError` with the way out.
+`NoMotion`. A method whose library is missing raises a `ModuleNotFoundError` that says how to
+install it.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class NoMotion(RuntimeError):
 
 
 def baseline(name: str) -> Callable[..., np.ndarray]:
-    """The method of that name (`NAMES` lists them); ValueError where there is none."""
+    """The method of that name (`NAMES` lists them); raises ValueError for an unknown name."""
     if name not in _HOMES:
         raise ValueError(f"name is {name!r}, wanted one of {', '.join(NAMES)}")
     module, function = _HOMES[name].split(":")

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cfr_jax.evaluation.baselines.icp import descend
-from cfr_jax.evaluation.baselines.open3d_clouds import described, open3d_cloud
+from cfr_jax.evaluation.baselines.open3d_clouds import FeatureOptions, open3d_cloud
 from cfr_jax.io import PointCloud
 from cfr_jax.runtime.optional import require
 
@@ -17,22 +17,19 @@ def register(
     source: PointCloud,
     target: PointCloud,
     *,
-    distance: float,
-    normal_radius: float,
-    feature_radius: float,
-    voxel: float | None = None,
     iterations: int = 64,
-    seed: int = 0,
+    **options: Any,
 ) -> Float[np.ndarray, "4 4"]:
-    """FGR with correspondences from FPFH over `feature_radius`, robust beyond `distance`.
+    """FGR with correspondences from FPFH, robust beyond `distance`.
 
-    The clouds are thinned to `voxel` first, if it is given; `seed` chooses the tuples tested.
+    `options` are those of `FeatureOptions`; `seed` chooses the tuples tested.
     """
     o3d = require("open3d")
     methods = o3d.pipelines.registration
-    made = [described(c, normal_radius, feature_radius, voxel) for c in (source, target)]
-    (source_cloud, source_features), (target_cloud, target_features) = made
-    o3d.utility.random.seed(seed)
+    given = FeatureOptions(**options)
+    source_cloud, source_features = given.described(source)
+    target_cloud, target_features = given.described(target)
+    o3d.utility.random.seed(given.seed)
     found = methods.registration_fgr_based_on_feature_matching(
         source_cloud,
         target_cloud,
@@ -42,7 +39,7 @@ def register(
             # the distance is in the clouds' unit, not a share of their extent
             use_absolute_scale=True,
             decrease_mu=True,
-            maximum_correspondence_distance=distance,
+            maximum_correspondence_distance=given.distance,
             iteration_number=iterations,
         ),
     )

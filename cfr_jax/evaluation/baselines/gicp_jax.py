@@ -1,4 +1,4 @@
-"""Our own refinement (`cfr_jax.refine.generalized_icp`) without the network before it."""
+"""Our own refinement (`cfr_jax.refine.generalized_icp`), without a network before it."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def register(
 ) -> Float[np.ndarray, "4 4"]:
     """Generalized ICP whose robust cut shrinks over 4, 2 and 1 times `cut`.
 
-    The clouds are brought to the size at which that is the refinement's usual last cut. Normals
-    are estimated where they are missing.
+    The clouds are scaled so that `cut` becomes the refinement's usual last cut. Missing normals are
+    estimated.
     """
     motion = initial(source, target, start)
     center, scale = target.points.mean(axis=0), cut / CUT

@@ -1,4 +1,4 @@
-"""Iterative closest points (Besl & McKay, 1992; Chen & Medioni, 1991), by Open3D."""
+"""Iterative closest point (Besl & McKay, 1992; Chen & Medioni, 1991), by Open3D."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def point_to_plane(
     start: Start = "centroid",
     iterations: int = 100,
 ) -> Float[np.ndarray, "4 4"]:
-    """The same to the tangent planes of the target, whose normals are estimated if missing."""
+    """The same, to the tangent planes of the target; missing normals are estimated."""
     methods = require("open3d").pipelines.registration
     return descend(
         open3d_cloud(source),
@@ -62,7 +62,7 @@ def descend(
     distances: tuple[float, ...],
     iterations: int,
 ) -> Float[np.ndarray, "4 4"]:
-    """ICP on Open3D's clouds from `motion`, a stage for each distance."""
+    """ICP on Open3D clouds, starting from `motion`, with one stage per distance."""
     methods = require("open3d").pipelines.registration
     criteria = methods.ICPConvergenceCriteria(max_iteration=iterations)
     for distance in distances:

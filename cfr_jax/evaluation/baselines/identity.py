@@ -1,4 +1,4 @@
-"""No registration at all: what the pairs ask for."""
+"""No registration at all: its errors show how far the pairs are moved."""
 
 from __future__ import annotations
 

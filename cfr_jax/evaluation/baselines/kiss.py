@@ -19,9 +19,9 @@ def register(
     normal_gain: float = 3.0,
     feature_gain: float = 5.0,
 ) -> Float[np.ndarray, "4 4"]:
-    """KISS-Matcher, all of whose lengths follow from `voxel`; with `thin` it thins to that first.
+    """KISS-Matcher; all of its lengths follow from `voxel`. With `thin`, it thins to `voxel` first.
 
-    The gains are the radii of normals and features, in voxels; given normals are not used.
+    The gains are the radii of normals and features, in voxels. It does not use given normals.
     """
     kiss_matcher = require("kiss_matcher")
     config = kiss_matcher.KISSMatcherConfig(
@@ -34,7 +34,7 @@ def register(
         source.points.astype(np.float32), target.points.astype(np.float32)
     )
     if not found.valid:
-        raise NoMotion("KISS-Matcher says that its solution is not valid")
+        raise NoMotion("KISS-Matcher reports that its solution is not valid")
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = found.rotation, found.translation
     return motion

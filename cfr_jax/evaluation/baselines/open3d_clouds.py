@@ -1,7 +1,8 @@
-"""Our clouds as Open3D's, with what the classical methods need besides points."""
+"""Converts clouds to Open3D, with the normals and features that classical methods need."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from cfr_jax.data.scans import estimate_normals
@@ -14,8 +15,9 @@ def open3d_cloud(
 ) -> Any:
     """An `open3d.geometry.PointCloud`, thinned to `voxel` if that is given.
 
-    With a `normal_radius` it has normals: its own, or else estimated before the thinning from at
-    most 30 points within the radius, facing the centroid, so that two views agree on the sign.
+    With a `normal_radius` the result has normals. If the cloud has none, they are estimated before
+    the thinning, from at most 30 points within the radius. They face the centroid, so that two
+    views agree on the sign.
     """
     o3d = require("open3d")
     made = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))
@@ -33,11 +35,22 @@ def open3d_cloud(
     return thinned
 
 
-def described(
-    cloud: PointCloud, normal_radius: float, feature_radius: float, voxel: float | None
-) -> tuple[Any, Any]:
-    """A cloud and its fast point feature histograms (FPFH; Rusu et al., 2009)."""
-    o3d = require("open3d")
-    made = open3d_cloud(cloud, normal_radius, voxel)
-    around = o3d.geometry.KDTreeSearchParamHybrid(radius=feature_radius, max_nn=100)
-    return made, o3d.pipelines.registration.compute_fpfh_feature(made, around)
+@dataclass(frozen=True, kw_only=True)
+class FeatureOptions:
+    """What FGR and RANSAC take alike; lengths are in the unit of the clouds."""
+
+    distance: float
+    """Up to which a correspondence counts."""
+    normal_radius: float
+    feature_radius: float
+    """Of the neighborhoods that a feature describes."""
+    voxel: float | None = None
+    """The clouds are thinned to this first, if it is given."""
+    seed: int = 0
+
+    def described(self, cloud: PointCloud) -> tuple[Any, Any]:
+        """A cloud and its fast point feature histograms (FPFH; Rusu et al., 2009)."""
+        o3d = require("open3d")
+        made = open3d_cloud(cloud, self.normal_radius, self.voxel)
+        around = o3d.geometry.KDTreeSearchParamHybrid(radius=self.feature_radius, max_nn=100)
+        return made, o3d.pipelines.registration.compute_fpfh_feature(made, around)

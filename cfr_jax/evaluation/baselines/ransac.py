@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
-from cfr_jax.evaluation.baselines.open3d_clouds import described
+from cfr_jax.evaluation.baselines.open3d_clouds import FeatureOptions
 from cfr_jax.io import PointCloud
 from cfr_jax.runtime.optional import require
 
@@ -16,34 +18,31 @@ def register(
     source: PointCloud,
     target: PointCloud,
     *,
-    distance: float,
-    normal_radius: float,
-    feature_radius: float,
-    voxel: float | None = None,
     iterations: int = 50_000,
-    seed: int = 0,
+    **options: Any,
 ) -> Float[np.ndarray, "4 4"]:
     """The best of `iterations` hypotheses of three correspondences, inliers within `distance`.
 
-    The clouds are thinned to `voxel` first, if it is given. The same `seed` gives the same answer
-    only on one thread: with more, threads race for the random numbers.
+    `options` are those of `FeatureOptions`. The same `seed` gives the same answer only on one
+    thread: with more, threads race for the random numbers.
     """
     o3d = require("open3d")
     methods = o3d.pipelines.registration
-    made = [described(c, normal_radius, feature_radius, voxel) for c in (source, target)]
-    (source_cloud, source_features), (target_cloud, target_features) = made
-    o3d.utility.random.seed(seed)
+    given = FeatureOptions(**options)
+    source_cloud, source_features = given.described(source)
+    target_cloud, target_features = given.described(target)
+    o3d.utility.random.seed(given.seed)
     found = methods.registration_ransac_based_on_feature_matching(
         source_cloud,
         target_cloud,
         source_features,
         target_features,
         mutual_filter=True,
-        max_correspondence_distance=distance,
+        max_correspondence_distance=given.distance,
         ransac_n=3,
         checkers=[
             methods.CorrespondenceCheckerBasedOnEdgeLength(_EDGES),
-            methods.CorrespondenceCheckerBasedOnDistance(distance),
+            methods.CorrespondenceCheckerBasedOnDistance(given.distance),
         ],
         criteria=methods.RANSACConvergenceCriteria(iterations, 0.999),
     )

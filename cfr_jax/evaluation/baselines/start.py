@@ -1,4 +1,4 @@
-"""Where a local method starts."""
+"""The motion from which a local method starts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ Start = Literal["identity", "centroid"]
 
 
 def initial(source: PointCloud, target: PointCloud, start: Start) -> Float[np.ndarray, "4 4"]:
-    """The identity, or the translation that lays the centroid of the source on the target's."""
+    """The identity, or the translation that moves the source's centroid onto the target's.
+
+    Raises ValueError for an unknown `start`.
+    """
     if start not in ("identity", "centroid"):
         raise ValueError(f"start is {start!r}, wanted 'identity' or 'centroid'")
     motion = np.eye(4)

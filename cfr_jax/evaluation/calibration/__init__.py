@@ -1,1 +1,1 @@
-"""What a confidence is fitted with and measured by: trials, the fit, reliability."""
+"""Fits and measures confidences: trials, the fit, reliability."""

@@ -1,6 +1,6 @@
-"""Fits the confidences of `register` and of `align` to what weights answer where it is known.
+"""Fits the confidences of `register` and `align` to answers that are known to be right or wrong.
 
-Both are logistic regressions on clues (`networks.probability`); right means within 5 degrees and a
+Both are logistic regressions on clues (`networks.probability`). Right means within 5 degrees and a
 tenth of the radius.
 """
 
@@ -23,20 +23,21 @@ from cfr_jax.evaluation import metrics
 from cfr_jax.evaluation.calibration.trials import Trial, Trials
 from cfr_jax.networks.cfr.registration import Registration, register
 from cfr_jax.networks.probability import BIAS, KEY, Calibration, calibration_of, uncalibrated
+from cfr_jax.networks.record import Params
 from cfr_jax.weights.files import load_params
 
 USED = {"register": confidence.OF_NETWORK, "align": confidence.NAMES}
 """The clues of each confidence."""
 _RIGHT = 5.0, 0.1  # degrees, radii
-_LEAST = 10  # answers of either kind, without which there is nothing to tell apart
-_PENALTY = 1e-3  # on the squared weights: clues overlap
+_LEAST = 10  # right answers, and wrong answers, that a fit needs at least
+_PENALTY = 1e-3  # on the squared weights, because the clues overlap
 _DIGITS = 4
 _FOLDS = 5
 
 
 @dataclasses.dataclass(frozen=True)
 class Gathered:
-    """What was found of `n` trials: clues, whether register and align were right, the group."""
+    """The findings of `n` trials: clues, whether `register` and `align` were right, the group."""
 
     clues: dict[str, Float[np.ndarray, "n c"]]
     right: dict[str, Bool[np.ndarray, " n"]]
@@ -44,7 +45,7 @@ class Gathered:
 
 
 def gather(
-    params: dict,
+    params: Params,
     trials: Trials,
     count: int,
     *,
@@ -52,12 +53,12 @@ def gather(
     made_of: str = "",
     told: Callable[[int], object] = lambda _: None,
 ) -> Gathered:
-    """What weights find of the first `count` trials.
+    """Registers the first `count` trials with the weights `params` and gathers the findings.
 
-    `align` takes its second look by the calibration that the parameters carry, or by that of the
-    weights that ship where they carry none. With `kept`, an .npz file, a call that was cut off goes
-    on from there; `made_of` says what the answers depend on. `told` is called with the number of
-    trials found since it was last called. Raises ValueError for a file that was made of others.
+    The second look of `align` needs a calibration: that of the parameters, or if they have none,
+    that of the shipped default weights. With `kept`, an .npz file, an interrupted call resumes from
+    that file; `made_of` says what the answers depend on. `told` is called with the number of trials
+    done since its last call. Raises ValueError if the file was made with another `made_of`.
     """
     if calibration_of(params) is None:
         params = {**params, KEY: calibration_of(load_params())}
@@ -76,17 +77,17 @@ def gather(
 
 
 def check_enough(found: Gathered) -> None:
-    """Raises ValueError where too few answers were right, or wrong, to tell these from those."""
+    """Raises ValueError if too few answers were right, or too few wrong, for a fit."""
     for name, right in found.right.items():
         if min(right.sum(), (~right).sum()) < _LEAST:
             raise ValueError(
                 f"pairs: {name} answered {right.sum()} right and {(~right).sum()} wrong, wanted at "
-                f"least {_LEAST} of each; take more pairs, or other data"
+                f"least {_LEAST} of each; use more pairs or other data"
             )
 
 
 def fit_calibration(found: Gathered) -> Calibration:
-    """The calibration that fits what was found."""
+    """The calibration that fits the findings."""
     fitted = {}
     for name, clues in USED.items():
         *weights, bias = fit(found.clues[name], found.right[name]).round(_DIGITS).tolist()
@@ -95,7 +96,7 @@ def fit_calibration(found: Gathered) -> Calibration:
 
 
 def fit(clues: Float[np.ndarray, "n c"], right: Bool[np.ndarray, " n"]) -> np.ndarray:
-    """Weights (c,) and bias of a penalized logistic regression, for clues as they are."""
+    """Weights (c,) and the bias of a penalized logistic regression, for clues as given."""
     center, spread = clues.mean(axis=0), clues.std(axis=0) + 1e-9
     design = np.column_stack([(clues - center) / spread, np.ones(len(clues))])
 
@@ -111,12 +112,12 @@ def fit(clues: Float[np.ndarray, "n c"], right: Bool[np.ndarray, " n"]) -> np.nd
 
 
 def predict(fitted: np.ndarray, clues: Float[np.ndarray, "n c"]) -> Float[np.ndarray, " n"]:
-    """Probability that each answer is right, by weights and bias as `fit` gives them."""
+    """The probability that each answer is right; `fitted` is what `fit` returned."""
     return 1 / (1 + np.exp(-(clues @ fitted[:-1] + fitted[-1])))
 
 
 def cross_validated(found: Gathered, name: str) -> Float[np.ndarray, " n"]:
-    """The probability of each answer by a fit to other shapes or pairs."""
+    """The probability of each answer, from a fit to other shapes or pairs."""
     clues, right = found.clues[name], found.right[name]
     chance = np.zeros(len(right))
     for fold in range(_FOLDS):
@@ -127,20 +128,20 @@ def cross_validated(found: Gathered, name: str) -> Float[np.ndarray, " n"]:
 
 
 def predicted(calibration: Calibration, found: Gathered, name: str) -> Float[np.ndarray, " n"]:
-    """The probability of each answer by a calibration."""
+    """The probability of each answer, from a calibration."""
     fitted = dict(getattr(calibration, name))
     weights = [fitted[clue] for clue in USED[name]]
     return predict(np.array([*weights, fitted[BIAS]]), found.clues[name])
 
 
-def _row(params: dict, trial: Trial) -> list[float]:
+def _row(params: Params, trial: Trial) -> list[float]:
     """The clues of both answers to a trial, whether each is right, and the trial's group."""
     found = align(
         trial.source, trial.target, params=params, initial="global" if trial.searched else None
     )
-    # `register` alone makes one cascade, and takes no second look
+    # `register` by itself runs one cascade and takes no second look
     plan = planned(trial.source, trial.target, initial=found.initial if trial.searched else None)
-    arguments = solving.on_device(plan.source), solving.on_device(plan.target)
+    arguments = solving.on_device(plan.source, plan.target)
     alone = _register(uncalibrated(params), *arguments)
     of_network = [float(getattr(alone.clues, name)) for name in confidence.OF_NETWORK]
     right = [False, False]
@@ -158,8 +159,8 @@ def is_right(
     center: tuple[float, float, float],
     radius: float,
 ) -> bool:
-    """Whether an answer is within 5 degrees of the truth, and lays `center` within a tenth of
-    `radius` of where it belongs."""
+    """Whether an answer is within 5 degrees of the truth and moves `center` to within a tenth of
+    `radius` of its true position."""
     angle = metrics.err_r(answer[None], truth[None])[0]
     away = (answer - truth) @ np.array([*center, 1.0])
     return bool(angle < _RIGHT[0] and np.linalg.norm(away[:3]) < _RIGHT[1] * radius)
@@ -167,7 +168,7 @@ def is_right(
 
 @jax.jit
 def _register(
-    params: dict, source: solving.DeviceCloud, target: solving.DeviceCloud
+    params: Params, source: solving.DeviceCloud, target: solving.DeviceCloud
 ) -> Registration:
     return register(params, source.prepared(), target.prepared(), settings=SETTINGS)
 
@@ -179,7 +180,7 @@ def _kept_rows(kept: Path | None, made_of: str) -> list[list[float]]:
         with np.load(kept, allow_pickle=False) as held:
             rows, digest = held["rows"], str(held["made_of"])
     except (OSError, ValueError, KeyError) as error:
-        raise ValueError(f"keep: {kept} holds nothing gathered here ({error})") from error
+        raise ValueError(f"keep: {kept} does not hold findings of trials ({error})") from error
     if digest != _digest(made_of):
         raise ValueError(f"keep: {kept} was gathered with other weights, data, seed, or clues")
     return rows.tolist()

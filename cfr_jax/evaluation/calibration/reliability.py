@@ -1,4 +1,4 @@
-"""How far probabilities hold: calibration, ranking, and the two pictures of them."""
+"""How well probabilities hold: calibration, ranking, and a figure of both."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ def calibration_error(chance: np.ndarray, right: np.ndarray, bins: int = _BINS) 
 
 
 def ranking(chance: np.ndarray, right: np.ndarray) -> float:
-    """Area under the ROC curve: how often a right answer is given more than a wrong one."""
+    """Area under the ROC curve: how often a right answer gets more confidence than a wrong one."""
     above = chance[right][:, None] - chance[~right][None, :]
     return float(np.mean(above > 0) + np.mean(above == 0) / 2)
 
 
 def summary(chance: np.ndarray, right: np.ndarray) -> dict[str, Any]:
-    """Both figures with 95% intervals from resampled pairs, and what trusting at 0.5 gives."""
+    """Calibration error, ROC area with its 95% interval (pairs resampled), and the effect of
+    trusting answers from 0.5 on."""
     rng = np.random.default_rng(0)
     areas = []
     for _ in range(_RESAMPLED):
         rows = rng.integers(len(right), size=len(right))
         if 0 < right[rows].sum() < len(rows):
             areas.append(ranking(chance[rows], right[rows]))
-    # what a perfectly calibrated probability would show on so few pairs, by chance alone
+    # what perfectly calibrated probabilities would show by chance, on this number of pairs
     perfect = [calibration_error(chance, rng.random(len(chance)) < chance) for _ in range(200)]
     trusted = chance >= 0.5
     return {
@@ -48,7 +49,7 @@ def summary(chance: np.ndarray, right: np.ndarray) -> dict[str, Any]:
 
 
 def in_words(measured: dict[str, Any]) -> str:
-    """A `summary` in a line."""
+    """A `summary` on one line."""
     low, high = measured["roc_area_95"]
     return (
         f"right {measured['right']:.0%} of {measured['pairs']}, "
@@ -61,8 +62,11 @@ def in_words(measured: dict[str, Any]) -> str:
 
 
 def draw(path: Path, curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
-    """The reliability diagram, and the rejection curve: of the answers kept when the least certain
-    are thrown away, the share that is wrong."""
+    """Draws the reliability diagram and the rejection curve.
+
+    The rejection curve shows, when the least certain answers are dropped, which share of the kept
+    ones is wrong.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4), layout="constrained")
@@ -97,7 +101,7 @@ def _share(right: np.ndarray) -> float:
 
 
 def _bins(chance: np.ndarray, right: np.ndarray, bins: int) -> Iterator[tuple[float, float, float]]:
-    """Mean confidence, share right, and share of all pairs, of each bin that is not empty."""
+    """For each bin that is not empty: mean confidence, share right, and share of all pairs."""
     place = np.minimum((chance * bins).astype(int), bins - 1)
     for b in range(bins):
         here = place == b

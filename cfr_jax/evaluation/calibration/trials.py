@@ -1,14 +1,18 @@
-"""What a confidence is fitted to: pairs whose answer is known, easy ones and hopeless ones.
+"""Trials, to which a confidence is fitted: pairs whose answer is known, from easy to hopeless.
 
-A probability can only be learned from right and wrong answers. So of ten pairs made of a corpus of
-shapes three are of the partial protocol with exact normals and two with estimated ones, three of
-these five turned either way about each axis instead of one; two keep only half of each shape (one
-with estimated normals); one is turned by any rotation and searched globally; one is turned by up to
-90 degrees about each axis and is not searched; and one is of two different shapes.
+A probability can only be learned from right and wrong answers. So of every ten pairs from a corpus
+of shapes:
 
-Of pairs of your own both clouds stay whole in six of ten, and a half of each is cut off in the
-others, by planes of any direction. Five are turned about their center: two either way by up to 45
-degrees about each axis, two by up to 90, one by any rotation, which is searched globally.
+- five follow the partial protocol, two of them with estimated normals; three of the five are
+  rotated either way about each axis instead of one way;
+- two keep only half of each shape, one of them with estimated normals;
+- one is rotated by any rotation and searched globally;
+- one is rotated by up to 90 degrees about each axis and not searched;
+- one consists of two different shapes.
+
+Of every ten pairs of your own, six keep both clouds whole. The other four lose half of each cloud,
+cut off by planes of any direction. Five are rotated about their center: two by up to 45 degrees
+either way about each axis, two by up to 90, and one by any rotation, which is searched globally.
 """
 
 from __future__ import annotations
@@ -41,8 +45,8 @@ _SHAPES = (
     (partial_both_ways, True), (low_overlap, False), (low_overlap, True),
     (partial_any_rotation, False), (_TURNED, False), (partial, True),
 )  # fmt: skip
-_SEARCHED, _DIFFERENT = 7, 9  # places in the mix
-# by how many degrees, at most, about each axis (None: any rotation, searched globally), and whether
+_SEARCHED, _DIFFERENT = 7, 9  # positions in `_SHAPES`
+# largest rotation about each axis in degrees (None: any rotation, searched globally), and whether
 # half of each cloud is cut off
 _PAIRS = (
     (0.0, False), (45.0, False), (0.0, True), (90.0, False), (0.0, False),
@@ -52,26 +56,27 @@ _PAIRS = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
-    """Two clouds to align, and what a right answer is."""
+    """Two clouds to align, and what makes an answer right."""
 
     source: Float[np.ndarray, "n c"]
     """Points (n, 3), or points and normals (n, 6)."""
     target: Float[np.ndarray, "m c"]
     truth: Float[np.ndarray, "4 4"] | None
-    """From source onto target; None where the clouds are of two things, and no answer is right."""
+    """From source onto target; None if the clouds show different things, so no answer is right."""
     searched: bool
-    """Whether all rotations are to be tried."""
+    """Whether to search all rotations."""
     group: int
-    """The shape or the pair it was made of: a fit is tested on groups it has not seen."""
+    """The shape or pair that it was made from; a fit is tested on groups it has not seen."""
     radius: float | None = None
-    """What translations are measured by; None: the scale at which `align` worked."""
+    """The unit in which translation errors are judged; None: the scale at which `align` worked."""
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where translations are compared; far from the clouds, a small turn is a long way."""
+    """The point at which translations are compared. Far from the clouds, a small rotation would
+    look like a large translation."""
 
 
 @dataclasses.dataclass(frozen=True)
 class OfShapes:
-    """Trials made of a corpus, whose shapes fill the unit sphere."""
+    """Trials made from a corpus, whose shapes fill the unit sphere."""
 
     corpus: Corpus
     seed: int
@@ -97,7 +102,7 @@ class OfShapes:
 
 @dataclasses.dataclass(frozen=True)
 class OfPairs:
-    """Trials made of pairs whose motions are known."""
+    """Trials made from pairs with known motions."""
 
     pairs: Sequence[Pair]
     seed: int
@@ -131,11 +136,11 @@ class OfPairs:
 
 
 Trials = OfShapes | OfPairs
-"""As many trials as are asked for; each depends on its number alone."""
+"""Any number of trials; each depends only on its number and the seed."""
 
 
 def open_trials(path: str | Path, seed: int) -> Trials:
-    """Trials of a corpus of shapes, or of a list or an HDF5 file of pairs with known motions.
+    """Trials from a corpus of shapes, or from a list or an HDF5 file of pairs with known motions.
 
     Raises ValueError for other data.
     """
@@ -143,12 +148,12 @@ def open_trials(path: str | Path, seed: int) -> Trials:
     kind = layout.kind
     if kind.read_shapes is not None:
         return OfShapes(kind.read_shapes(Path(path)), seed)
-    # pairs that need no settings: their files say which clouds and which truth
+    # only pairs that need no settings: their files name the clouds and the truth
     if kind.evaluate is not None and not settings_of(kind.evaluate)[0]:
         return OfPairs(kind.evaluate(path, Path()), seed)
     raise ValueError(
         f"data: {layout}; wanted a list or an HDF5 file of pairs with their transforms, or a "
-        "corpus of shapes (`cfr data build` makes one of meshes)"
+        "corpus of shapes (`cfr data build` makes one from meshes)"
     )
 
 

@@ -1,1 +1,1 @@
-"""Tables, plots and a gallery of what was measured."""
+"""Tables, plots and a gallery of the measurements."""

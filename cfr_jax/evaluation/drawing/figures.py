@@ -1,4 +1,4 @@
-"""Plots of what the table sums up."""
+"""Plots of the errors that the table summarizes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ from cfr_jax.runtime.atomic import write_atomically
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_BINS = 5  # of pairs sorted by overlap or rotation, equally many in each
+_BINS = 5  # bins of pairs sorted by overlap or rotation, with equally many pairs each
 _DPI = 150
-_NO_METHODS = ("identity", "truth")  # bounds, which only stretch the axes
+_NO_METHODS = ("identity", "truth")  # bounds, which would only stretch the axes
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """A figure that needs no display; ModuleNotFoundError without matplotlib says what to do."""
+    """A figure that needs no display.
+
+    Raises a ModuleNotFoundError that says what to do if matplotlib is missing.
+    """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -38,7 +41,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """As PNG; the same figure gives the same file."""
+    """Writes a figure as PNG; the same figure gives the same file."""
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=_DPI, metadata={"Software": None})
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,7 +73,7 @@ def draw_all(
 def recall_over_error(
     path: Path, measured: Sequence[Measured], angle: float, distance: float, unit: str
 ) -> None:
-    """Share of all pairs whose error is below a bound, over the bound."""
+    """Share of all pairs whose error is below a bound, plotted over the bound."""
     figure = new_figure(11, 4.2)
     panels = ("err_r", angle), ("err_t", distance)
     for axes, (name, most) in zip(figure.subplots(1, 2), panels, strict=True):
@@ -89,7 +92,7 @@ def by_quantity(
     label: str,
     about: dict[str, Any],
 ) -> None:
-    """Median rotation error and recall in bins of equally many pairs."""
+    """Median rotation error and recall, in bins of equally many pairs sorted by `quantity`."""
     bins = np.array_split(np.argsort(quantity, kind="stable"), min(_BINS, len(quantity)))
     centers = [quantity[rows].mean() for rows in bins]
     threshold = tuple(about["main_threshold"])
@@ -106,8 +109,10 @@ def by_quantity(
 
 
 def by_iteration(path: Path, measured: Sequence[Measured], unit: str) -> None:
-    """Mean and median error after each iteration, of the methods that tell more than one; a
-    refinement counts as one more."""
+    """Mean and median error after each iteration, for methods that report more than one.
+
+    A refinement counts as one more iteration.
+    """
     if all(m.err_r.shape[1] == 1 for m in measured):
         return
     shown = [metric for metric in metrics.table() if metric.each_iteration]
@@ -127,7 +132,7 @@ def by_iteration(path: Path, measured: Sequence[Measured], unit: str) -> None:
 
 
 def time_against_accuracy(path: Path, measured: Sequence[Measured], about: dict[str, Any]) -> None:
-    """Each method a point: how long it takes, and how good it is."""
+    """One point per method: how long it takes, and how good it is."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     figure = new_figure(11, 4.2)
@@ -141,7 +146,7 @@ def time_against_accuracy(path: Path, measured: Sequence[Measured], about: dict[
             axes.plot([time], [value], marker="o", ms=9, **style | {"ls": ""})
     for axes in (left, right):
         axes.set(xscale="log", xlabel="ms per pair")
-        # less than two decades: powers of ten alone would say little
+        # the axis covers less than two decades: powers of ten alone would be too few ticks
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
@@ -151,7 +156,7 @@ def time_against_accuracy(path: Path, measured: Sequence[Measured], about: dict[
 
 
 def time_by_module(path: Path, measured: Sequence[Measured]) -> None:
-    """A group of bars for each module, a bar for each method whose modules were timed."""
+    """A group of bars for each module, with one bar for each method whose modules were timed."""
     if not measured:
         return
     parts = list(dict.fromkeys(part for m in measured for part in m.modules or {}))
@@ -171,7 +176,7 @@ def time_by_module(path: Path, measured: Sequence[Measured]) -> None:
 
 
 def _styled(measured: Sequence[Measured]) -> list[tuple[dict[str, Any], Measured]]:
-    """Our own methods solid and bold, the others dashed; a color each."""
+    """The style of each method: ours solid and bold, the others dashed, each in its own color."""
     from matplotlib import colormaps
 
     colors = colormaps["tab20"]

@@ -1,4 +1,4 @@
-"""Pairs to look at: where a method did best, middling and worst."""
+"""Pairs to look at: where a method did best, about average, and worst."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _SOURCE, _TARGET = "#f0a000", "#0090d0"
 
 
 def chosen(measured: Measured) -> dict[str, list[int]]:
-    """The pairs with the smallest, the middle and the largest rotation errors among those answered.
+    """The answered pairs with the smallest, the middle, and the largest rotation errors.
 
-    Few pairs are shown once, in the first row that asks for them.
+    If there are few, a pair appears only in the first row that would show it.
     """
     answered = np.flatnonzero(measured.answered)
     ranked = answered[np.argsort(measured.err_r[answered, -1], kind="stable")].tolist()
@@ -45,7 +45,7 @@ def chosen(measured: Measured) -> dict[str, list[int]]:
 
 
 def draw_gallery(path: Path, measured: Measured, records: Records, pairs: Sequence[Pair]) -> None:
-    """A PNG with before and after of each pair chosen; nothing where nothing was answered."""
+    """Writes a PNG with each chosen pair, before and after; nothing if no pair was answered."""
     rows = chosen(measured)
     if not rows["best"]:
         return
@@ -56,7 +56,7 @@ def draw_gallery(path: Path, measured: Measured, records: Records, pairs: Sequen
     for line, (name, indices) in zip(panels, rows.items(), strict=True):
         for place, index in enumerate(indices):
             pair, found = pairs[index], records.by_pair[index].transforms
-            assert found is not None  # only pairs that were answered are chosen
+            assert found is not None  # only answered pairs are chosen
             scene = Scene(
                 source=pair.source,
                 target=pair.target,
@@ -74,7 +74,7 @@ def draw_gallery(path: Path, measured: Measured, records: Records, pairs: Sequen
 
 
 def _draw(axes: Axes, scene: Scene, station: int) -> None:
-    """Both clouds, from back to front."""
+    """Draws both clouds, from back to front."""
     view = best_view(scene)
     clouds = [_some(np.asarray(scene.target)), _some(scene.moved(station))]
     points = (np.concatenate(clouds) - view.center) @ view.rotation.T

@@ -1,4 +1,4 @@
-"""The table in Markdown. What depends on the machine and the day stands apart from the errors."""
+"""The table in Markdown. What depends on machine and day is in a section apart from the errors."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def write_table(
     apart: Sequence[Measured] = (),
     numbers_apart: Mapping[str, Numbers] | None = None,
 ) -> str:
-    """All of it: errors, their intervals, times, failures, settings.
+    """The whole text: errors, their intervals, times, failures, settings.
 
-    `about` is what `running` knows of data and machine; `missing` tells why a method was left out;
-    `apart` and `numbers_apart` are the same without the pairs of nearly symmetric shapes. Same
-    answers, same text, but for the section `Time`.
+    `about` describes the data and the machine; `missing` says why a method was left out. `apart`
+    and `numbers_apart` are like `measured` and `numbers`, without the pairs of nearly symmetric
+    shapes. The same answers give the same text, except for the section `Time`.
     """
     unit = about["unit"]
     lengths = unit or "the unit of the clouds"
@@ -51,14 +51,15 @@ def write_table(
         *_failures(measured),
         "## Time",
         "",
-        f"{about['machine']}; table of {about['date']}, commit {about['commit']}, answers of the "
-        "commits beside them. Median of the pairs: from "
-        "clouds in host memory to the motion in host memory, device-synchronized, neighbors, "
-        "normals and features included. Imports, compilation and first-call costs are apart. "
+        f"{about['machine']}; table made on {about['date']} with commit {about['commit']}; the "
+        "last column has the commits of the answers. The time is the median over the pairs, from "
+        "clouds in host memory to the motion in host memory, device-synchronized, including "
+        "neighbors, normals and features. Imports, compilation and other costs of the first call "
+        "are in the start-up column. "
         f"Versions: {', '.join(f'{k} {v}' for k, v in about['versions'].items())}.",
         "",
         *_grid(
-            ["method", "ms / pair", "start-up s", "threads", "device", "pairs a call", "commit"],
+            ["method", "ms / pair", "start-up s", "threads", "device", "pairs / call", "commit"],
             [_times(m) for m in measured],
         ),
         "",
@@ -74,7 +75,7 @@ def _errors(
     numbers: Mapping[str, Numbers],
     columns: Sequence[Summary],
 ) -> list[str]:
-    """A row for each method, and once more with the intervals."""
+    """A table with a row for each method, and a second one with the intervals."""
     header = ["method", *(str(column.title) for column in columns)]
     values, intervals = (
         [
@@ -83,7 +84,7 @@ def _errors(
         ]
         for tell in (_value, _interval)
     )
-    failed = [str(len(m.failures)) for m in measured]
+    failed = [_failed(m) for m in measured]
     return [
         *_grid([*header, "failed"], [[*row, n] for row, n in zip(values, failed, strict=True)]),
         "",
@@ -91,6 +92,14 @@ def _errors(
         "",
         *_grid(header, intervals),
     ]
+
+
+def _failed(m: Measured) -> str:
+    """How many failed; why, where it was all of them, for one reason."""
+    reasons = set(m.failures.values())
+    if len(reasons) == 1 and not m.answered.any():
+        return f"{len(m.failures)}: {reasons.pop()}"
+    return str(len(m.failures))
 
 
 def _apart(
@@ -104,9 +113,9 @@ def _apart(
     return [
         "## Without nearly symmetric shapes",
         "",
-        f"{about['nearly_symmetric']} of the pairs are of shapes that some rotation lays on "
-        "themselves about as closely as sampling can tell (`cfr_jax/evaluation/symmetry.py`, a "
-        "rule on the shape alone); the others:",
+        f"{about['nearly_symmetric']} of the pairs show shapes that fit on themselves after some "
+        "rotation, about as closely as sampling can tell (`cfr_jax/evaluation/symmetry.py`, a "
+        "rule on the shape alone). These are the others:",
         "",
         *_errors(measured, numbers, columns),
         "",
@@ -114,7 +123,7 @@ def _apart(
 
 
 def _modules(measured: Sequence[Measured]) -> list[str]:
-    """Milliseconds of the parts of a network, where they were timed."""
+    """A table of the milliseconds of each part of a network, if any were timed."""
     timed = {m.name: m.modules for m in measured if m.modules}
     if not timed:
         return []
@@ -128,8 +137,8 @@ def _modules(measured: Sequence[Measured]) -> list[str]:
         for name, seconds in timed.items()
     ]
     return [
-        "Milliseconds a pair by module, each compiled alone, device-synchronized, on the threads "
-        "above; medians of a few pairs:",
+        "Milliseconds per pair by module, each compiled alone, device-synchronized, on the threads "
+        "above; medians over a few pairs:",
         "",
         *_grid(["method", *parts, "sum"], rows),
         "",
@@ -139,7 +148,7 @@ def _modules(measured: Sequence[Measured]) -> list[str]:
 def _columns(
     measured: Sequence[Measured], thresholds: Sequence[Sequence[float]], unit: str
 ) -> list[Summary]:
-    """Of every metric that some method was measured by, and the recalls."""
+    """The columns: summaries of every metric that was measured, and the recalls."""
     known = [metric for metric in metrics.table() if any(metric.name in m.errors for m in measured)]
     summaries = [summary for metric in known for summary in metric.summaries if summary.title]
     return summaries + [metrics.recall(angle, distance, unit) for angle, distance in thresholds]

@@ -1,1 +1,1 @@
-"""Methods as what solves pairs: what every solver answers, and the networks as solvers."""
+"""Methods as solvers of pairs: the interface that all of them have, and the networks."""

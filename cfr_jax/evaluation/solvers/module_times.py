@@ -1,7 +1,7 @@
 """How long the parts of a network take, each compiled alone (figure 6 of the paper).
 
-A part is run on the clouds of a pair as often as a registration runs it. The parts are those of the
-network as it is; their sum is a little more than a whole registration, compiled as one program.
+The time of a part counts as often as a registration of the pair runs it. The sum of all parts is a
+little more than a whole registration, which is compiled as one program.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ _REPEATS = 3
 def make_modules(
     network: Network, weights: str, settings: dict[str, Any] | None, estimated: bool
 ) -> Callable[[Sequence[Pair]], list[dict[str, float]]]:
-    """What tells the seconds of each module, for every pair given to it.
+    """A function that returns the seconds of each module, for every pair it is given.
 
     Raises ValueError for a network whose record names no parts.
     """
     if network.parts is None:
-        raise ValueError(f"modules: {network.title} does not say which parts it has")
+        raise ValueError(f"modules: the record of {network.title} names no parts to time")
     table.have(network)
     params = load_params(weights, network.name)
     parts = network.parts(params, network.settings(**settings or {}))
@@ -43,7 +43,7 @@ def make_modules(
 
 
 def seconds_of(parts: Iterator[Part]) -> dict[str, float]:
-    """Seconds of each module: the quickest of some runs, device-synchronized, compiled before."""
+    """Seconds of each module: the fastest of some synchronized runs, without compilation."""
     seconds: dict[str, float] = defaultdict(float)
     for part in parts:
         jax.block_until_ready(part.function(*part.arguments))
@@ -57,7 +57,7 @@ def seconds_of(parts: Iterator[Part]) -> dict[str, float]:
 
 
 def _clouds(pair: Pair, estimated: bool) -> list[Cloud]:
-    """The clouds as the networks take them; estimating normals belongs to no module."""
+    """The clouds as the networks take them; estimating normals is not part of any module."""
     found = []
     for cloud in clouds_of(pair, estimated):
         points = jnp.asarray(cloud.points, jnp.float32)

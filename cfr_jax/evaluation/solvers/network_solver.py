@@ -1,4 +1,4 @@
-"""The networks as solvers: in batches on clouds of one size, or pair by pair on clouds of any."""
+"""The networks as solvers: in batches for clouds of one size, or pair by pair for any size."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks import table
 from cfr_jax.networks.inputs import Cloud, Settings, moved_by
-from cfr_jax.networks.record import Network
+from cfr_jax.networks.record import Network, Params
 from cfr_jax.refine import Refinement, find
 from cfr_jax.runtime import programs
 from cfr_jax.weights.files import load_params
@@ -32,7 +32,7 @@ from cfr_jax.weights.files import load_params
 
 @dataclass(frozen=True)
 class Program:
-    """All that is compiled in."""
+    """Everything that is static in the compiled program."""
 
     network: Network
     settings: Any
@@ -56,24 +56,29 @@ def make_network(
     initial: Literal["global"] | None = None,
     seed: int = 0,
 ) -> Solver:
-    """A network with these weights, `settings` other than its usual ones, with or
-    without refinement after its last iteration, `cascades` times one after the other.
+    """A solver that runs a network with these weights.
 
-    "register" takes the clouds as they are, `batch` pairs a call, `vectorized` of them at a time
-    (one keeps a CPU's caches warm, an accelerator wants many); the time of a pair is its share of
-    the call's. "align" (CFR only) is `align`, pair by pair, with its `max_points`, `initial` and
-    `seed`; "preparation" brings clouds to the network's size and place as `align` does, for any
-    network.
+    `settings` replace its usual ones, `refine` adds a refinement after the last iteration, and it
+    runs `cascades` times, each starting where the one before it ended.
+
+    With `through="register"` it takes the clouds as they are, `batch` pairs per call, `vectorized`
+    of them at a time (one at a time keeps a CPU's caches warm, an accelerator wants many). The time
+    of a pair is its share of the call. "align" (CFR only) is `align`, pair by pair, with its
+    `max_points`, `initial` and `seed`. "preparation" works for any network: it scales and centers
+    clouds for the network as `align` does. Raises ValueError for options that do not go together.
     """
     if through not in ("register", "align", "preparation"):
         raise ValueError(f"through is {through!r}, wanted 'register', 'align' or 'preparation'")
     if cascades < 1:
         raise ValueError(f"cascades is {cascades}, wanted at least 1")
-    table.have(network)  # in a process of its own, the table has those of the package alone
+    table.have(network)  # in a new process, the table has only the networks of the package
     params = load_params(weights, network.name)
     if through == "align":
         if network.name != "cfr" or settings or cascades != 1:
-            raise ValueError("through 'align' is CFR as it is; wanted 'preparation' for others")
+            raise ValueError(
+                "through is 'align', which is only for CFR with its usual settings and one "
+                "cascade; wanted 'preparation' for anything else"
+            )
         return functools.partial(
             _align_each,
             params,
@@ -96,7 +101,7 @@ def make_network(
 
 
 def _align_each(
-    params: dict, refine: bool | str, estimated: bool, pairs: Sequence[Pair], **options: Any
+    params: Params, refine: bool | str, estimated: bool, pairs: Sequence[Pair], **options: Any
 ) -> list[Answer]:
     answers = []
     for pair in pairs:
@@ -109,7 +114,7 @@ def _align_each(
 
 
 def _prepare_each(
-    params: dict,
+    params: Params,
     program: Program,
     estimated: bool,
     max_points: int | None,
@@ -138,9 +143,9 @@ def _prepare_each(
 
 
 def _register_batches(
-    params: dict, program: Program, estimated: bool, size: int, pairs: Sequence[Pair]
+    params: Params, program: Program, estimated: bool, size: int, pairs: Sequence[Pair]
 ) -> list[Answer]:
-    """Clouds of different sizes go into different batches; a short batch repeats its last pair."""
+    """Batches hold clouds of the same size; a short batch repeats its last pair."""
     rows = defaultdict(list)
     for row, pair in enumerate(pairs):
         rows[len(pair.source), len(pair.target)].append(row)
@@ -161,7 +166,7 @@ def _register_batches(
 
 
 def _stacked(program: Program, pairs: Sequence[Pair], estimated: bool) -> list[Cloud]:
-    """Sources and targets as batches, neighbors found on the host where they are of use."""
+    """Sources and targets as batches; neighbors are searched on the host if they are needed."""
     settings = program.settings
     sides = zip(*(clouds_of(pair, estimated) for pair in pairs), strict=True)
     stacked = []
@@ -170,7 +175,10 @@ def _stacked(program: Program, pairs: Sequence[Pair], estimated: bool) -> list[C
         normals = [cloud.normals for cloud in clouds]
         without = [cloud.name for cloud in clouds if cloud.normals is None]
         if without and len(without) < len(clouds):
-            raise ValueError("of one batch all clouds have normals or none; set batch to 1")
+            raise ValueError(
+                "batch: got some clouds with normals and some without, wanted all or none in one "
+                "batch; set batch to 1"
+            )
         k = min(settings.neighbors, len(points[0]) - 1)
         if program.network.own_neighbors and not without:
             found = [np.zeros((len(cloud), 1), np.int32) for cloud in points]
@@ -187,9 +195,9 @@ def _stacked(program: Program, pairs: Sequence[Pair], estimated: bool) -> list[C
 
 
 def _run(
-    program: Program, params: dict, sources: Cloud, targets: Cloud
+    program: Program, params: Params, sources: Cloud, targets: Cloud
 ) -> tuple[Float[np.ndarray, "b i 4 4"], float]:
-    """Motions of a batch in host memory, and the seconds of it that were compilation."""
+    """The motions of a batch, in host memory, and the seconds that compilation took."""
     began = time.perf_counter()
     compiled = programs.compiled(_solve, params, sources, targets, program=program)
     compiling = time.perf_counter() - began
@@ -199,7 +207,7 @@ def _run(
 
 @functools.partial(jax.jit, static_argnames=("program",))
 def _solve(
-    params: dict, sources: Cloud, targets: Cloud, *, program: Program
+    params: Params, sources: Cloud, targets: Cloud, *, program: Program
 ) -> Float[Array, "b i 4 4"]:
     def of_pair(pair: tuple[Cloud, Cloud]) -> Array:
         source, target = (_with_normals(cloud) for cloud in pair)
@@ -215,21 +223,21 @@ def _solve(
 
 
 def _transforms(
-    program: Program, params: dict, source: Cloud, target: Cloud
+    program: Program, params: Params, source: Cloud, target: Cloud
 ) -> Float[Array, "i 4 4"]:
-    """Of all cascades, each started where the one before it ended."""
+    """The motions of all cascades; each cascade starts where the one before it ended."""
 
     def cascade(start: Array, _: None) -> tuple[Array, Array]:
         steps = program.network.unroll(params, moved_by(start, source), target, program.settings)
         transforms = jnp.stack([rigid.compose(step.transform, start) for step in steps])
         return transforms[-1], transforms
 
-    start = jnp.eye(4, dtype=jnp.float32)  # as the clouds of `_stacked` are
+    start = jnp.eye(4, dtype=jnp.float32)  # like the clouds of `_stacked`
     return jax.lax.scan(cascade, start, length=program.cascades)[1].reshape(-1, 4, 4)
 
 
 def _unless_missing(normals: np.ndarray | None) -> Any:
-    """On the device; None goes into a `Cloud` only on its way to `_with_normals`."""
+    """The normals on the device. A `Cloud` holds None only until `_with_normals` replaces it."""
     return None if normals is None else jnp.asarray(normals)
 
 

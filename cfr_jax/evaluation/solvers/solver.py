@@ -1,4 +1,4 @@
-"""What every method is in the end: a solver of pairs, and the clouds that it is given."""
+"""The interface of all methods: a solver of pairs, and the clouds that it is given."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from cfr_jax.io.cloud import usable_normals
 
 @dataclass(frozen=True)
 class Answer:
-    """What a method says of one pair."""
+    """The answer of a method to one pair."""
 
     transforms: Float[np.ndarray, "i 4 4"]
-    """One for each iteration it tells of; the last is the answer. Maps source onto target."""
+    """One per iteration that the method reports; the last one is the answer. They map source onto
+    target."""
     seconds: float
-    """From clouds in host memory to motions in host memory, without compilation."""
+    """Time from clouds in host memory to motions in host memory, without compilation."""
 
 
 Solver = Callable[[Sequence[Pair]], list[Answer]]
 
 
 def clouds_of(pair: Pair, estimated: bool) -> tuple[PointCloud, PointCloud]:
-    """Source and target, without their normals where these are unusable or not wanted."""
+    """Source and target, without normals if these are unusable or should be `estimated`."""
     return (
         _cloud("source", pair.source, None if estimated else pair.source_normals),
         _cloud("target", pair.target, None if estimated else pair.target_normals),

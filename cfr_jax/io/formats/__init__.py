@@ -2,7 +2,7 @@
 
 Each format is a record below; what parses it is in a file of its own in this folder: bytes in,
 points out. `add_format` adds one from outside. The table imports neither numpy nor any parser, so
-that help texts can show it.
+that help texts can list it.
 """
 
 from __future__ import annotations
@@ -31,14 +31,18 @@ class Format:
     Raises ValueError with the place in the file and what was wanted. It must not believe a header
     that promises more than the file's size allows.
     """
-    save: Callable[[BinaryIO, PointCloud], None] | None = None
-    """`save(stream, cloud)`; None: files of this format are only read."""
+    save: Callable[[BinaryIO, PointCloud], Iterable[str] | None] | None = None
+    """`save(stream, cloud)`; None: files of this format are only read. It may return sentences
+    about what the format cannot hold."""
     needs_folder: bool = False
     """Files that name other files: `parse` gets the folder as a third argument."""
     has_faces: Callable[[bytes], bool] | None = None
     """For `holds="either"`: whether the first bytes of a file announce a surface."""
     loose: bool = True
     """Whether a file found in a folder is taken for a scan; if not, it has to be named."""
+    has_columns: bool = False
+    """Whether `parse` takes the keywords `columns` (names that the user gave, or None) and `whole`
+    (whether the cloud is to carry its table, so that it can be written again)."""
     note: str = ""
     """A few words that help texts put in parentheses behind the suffixes."""
 
@@ -56,8 +60,8 @@ class Format:
 def later(home: str, name: str) -> Callable[..., Any]:
     """The function `name` of the module `home`, which is imported at the first call."""
 
-    def call(*args: Any) -> Any:
-        return getattr(import_module(home), name)(*args)
+    def call(*args: Any, **options: Any) -> Any:
+        return getattr(import_module(home), name)(*args, **options)
 
     return call
 
@@ -66,29 +70,57 @@ def _here(file: str, name: str) -> Callable[..., Any]:
     return later(f"{__name__}.{file}", name)
 
 
+def _cloud(
+    name: str,
+    suffixes: tuple[str, ...],
+    parse: str,
+    save: str | None = None,
+    *,
+    loose: bool = True,
+    note: str = "",
+) -> Format:
+    """A format of clouds whose columns a user may name; functions as "file:function"."""
+    return Format(
+        name,
+        suffixes,
+        "cloud",
+        _here(*parse.split(":")),
+        None if save is None else _here(*save.split(":")),
+        loose=loose,
+        has_columns=True,
+        note=note,
+    )
+
+
 _FORMATS: list[Format] = [
     Format(
         "PLY",
         (".ply",),
         "either",
-        _here("ply", "parse"),
-        _here("ply", "save"),
-        has_faces=_here("ply", "has_faces"),
+        _here("ply.reading", "parse"),
+        _here("ply.writing", "save"),
+        has_faces=_here("ply.reading", "has_faces"),
+        has_columns=True,
     ),
-    Format("PCD", (".pcd",), "cloud", _here("pcd", "parse"), _here("pcd", "save")),
-    Format("text", (".xyz", ".txt"), "cloud", _here("text", "parse"), _here("text", "save")),
+    _cloud("PCD", (".pcd",), "pcd.reading:parse", "pcd.writing:save"),
+    _cloud("text", (".xyz", ".txt", ".asc"), "text.table:parse", "text.writing:save"),
     # a table found in a folder may be a list of pairs, or anything
-    Format("CSV", (".csv",), "cloud", _here("text", "parse"), loose=False),
-    Format("NPY", (".npy",), "cloud", _here("arrays", "parse_npy"), _here("arrays", "save_npy")),
-    Format("NPZ", (".npz",), "cloud", _here("arrays", "parse_npz"), _here("arrays", "save_npz")),
-    Format("Velodyne", (".bin",), "cloud", _here("arrays", "parse_velodyne"), note="KITTI"),
-    Format("LAS", (".las",), "cloud", _here("las", "parse")),
-    Format("LAZ", (".laz",), "cloud", _here("las", "parse"), note='pip install "cfr_jax[io]"'),
-    Format("OFF", (".off",), "surface", _here("surfaces", "parse_off")),
-    Format("OBJ", (".obj",), "surface", _here("surfaces", "parse_obj")),
-    Format("STL", (".stl",), "surface", _here("surfaces", "parse_stl")),
-    Format("GLB", (".glb",), "surface", _here("gltf", "parse_glb"), needs_folder=True),
-    Format("glTF", (".gltf",), "surface", _here("gltf", "parse_gltf"), needs_folder=True),
+    _cloud("CSV", (".csv",), "text.table:parse", "text.writing:save_csv", loose=False),
+    _cloud("XYZN", (".xyzn",), "text.table:parse_xyzn"),
+    _cloud("XYZRGB", (".xyzrgb",), "text.table:parse_xyzrgb"),
+    _cloud("PTS", (".pts",), "text.leica:parse_pts"),
+    _cloud("PTX", (".ptx",), "text.leica:parse_ptx"),
+    _cloud("NPY", (".npy",), "arrays.npy:parse", "arrays.writing:save_npy"),
+    _cloud("NPZ", (".npz",), "arrays.npz:parse", "arrays.writing:save_npz"),
+    _cloud("Velodyne", (".bin",), "arrays.velodyne:parse", note="KITTI, nuScenes"),
+    _cloud("LAS", (".las",), "las.reading:parse"),
+    _cloud("LAZ", (".laz",), "las.reading:parse", note='pip install "cfr_jax[io]"'),
+    _cloud("E57", (".e57",), "e57:parse", note='pip install "cfr_jax[e57]"'),
+    Format("OFF", (".off",), "surface", _here("meshes.surfaces", "parse_off")),
+    Format("OBJ", (".obj",), "surface", _here("meshes.surfaces", "parse_obj")),
+    Format("STL", (".stl",), "surface", _here("meshes.stl", "parse")),
+    Format("GLB", (".glb",), "surface", _here("meshes.gltf", "parse_glb"), needs_folder=True),
+    Format("glTF", (".gltf",), "surface", _here("meshes.gltf", "parse_gltf"), needs_folder=True),
 ]
 
 

@@ -1,7 +1,7 @@
-"""What happens in the iterations of a registration, one after the other.
+"""The iterations of a registration, step by step.
 
-`registration.register` runs them for an answer; the loss and the measurements look at what lies
-between them.
+`registration.register` runs them and returns the answer; the loss and the measurements look at the
+steps in between.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from cfr_jax.geometry import rigid
 from cfr_jax.networks.cfr.modules import CFR
 from cfr_jax.networks.features import raw_features
 from cfr_jax.networks.inputs import Cloud, Settings, moved_by
-from cfr_jax.networks.record import Step
+from cfr_jax.networks.record import Params, Step
 from cfr_jax.networks.sinkhorn import Affinity, match
 
 
 @struct.dataclass
 class Encoded:
-    """The reference side of a registration, computed once for any number of sources."""
+    """The target's side of a registration, computed once for any number of sources."""
 
     cloud: Cloud
     features: Float[Array, "L m d"]
 
 
 def iterate(
-    params: dict, source: Cloud, target: Encoded, iterations: int, settings: Settings
+    params: Params, source: Cloud, target: Encoded, iterations: int, settings: Settings
 ) -> Iterator[Step]:
-    """The iterations of `register`, one by one, for those who need what lies between (the loss).
+    """Yields the iterations of `register` one by one, for callers that need the steps in between.
 
-    This is the scan over the parameters stacked on L, written out: iteration i runs i Sinkhorn
-    passes, and in a compiled loop that count could not be static.
+    This is a scan over the parameters stacked along L, unrolled: iteration i runs i Sinkhorn
+    passes, and that number could not be static inside a compiled loop.
     """
     network, count = bind(params), iterations_of(params)
     reference = target.cloud
@@ -70,12 +70,12 @@ def iterate(
 
 
 def moved_on(transform: Float[Array, "4 4"], source: Cloud, settings: Settings) -> Cloud:
-    """The source where an iteration found it to lie, for what comes next."""
+    """The source moved by the `transform` that an iteration found, for the next iteration."""
     return moved_by(lax.stop_gradient(transform) if settings.detach_motion else transform, source)
 
 
-def encoded(params: dict, cloud: Cloud, settings: Settings) -> Encoded:
-    """The features of a reference in every iteration."""
+def encoded(params: Params, cloud: Cloud, settings: Settings) -> Encoded:
+    """The features of a target in every iteration."""
     network = bind(params)
     heavy = heavy_features(network, cloud, settings)
     if settings.repeat_extraction:
@@ -85,24 +85,24 @@ def encoded(params: dict, cloud: Cloud, settings: Settings) -> Encoded:
     return Encoded(cloud, network.cascade.at_rest(heavy, cloud.points, cloud.mask))
 
 
-def unroll(params: dict, source: Cloud, target: Cloud, settings: Settings) -> Iterator[Step]:
-    """The iterations that the parameters were made for, both clouds given as they are."""
+def unroll(params: Params, source: Cloud, target: Cloud, settings: Settings) -> Iterator[Step]:
+    """Yields as many iterations as the parameters were made for; neither cloud is encoded yet."""
     reference = encoded(params, target, settings)
     return iterate(params, source, reference, iterations_of(params), settings)
 
 
-def iterations_of(params: dict) -> int:
-    """L, the number of iterations that the parameters were made for."""
+def iterations_of(params: Params) -> int:
+    """L: the number of iterations that the parameters were made for."""
     return params["annealing"]["out"]["bias"].shape[0] // 2
 
 
-def bind(params: dict) -> CFR:
-    """The network with its parameters inside."""
+def bind(params: Params) -> CFR:
+    """The network with these parameters bound to it."""
     shared = params["cascade"]["kernel"].shape[0] == 1
     return CFR(iterations_of(params), shared).bind({"params": params})
 
 
 def heavy_features(network: CFR, cloud: Cloud, settings: Settings) -> Float[Array, "n d"]:
-    """What every iteration starts from, extracted once; before any light layer."""
+    """The heavy features that all iterations start from, before any light layer."""
     raw = raw_features(cloud.points, cloud.normals, cloud.neighbors, ppf=settings.ppf)
     return network.features(raw, cloud.mask, settings.activations)

@@ -1,7 +1,7 @@
-"""The learned modules: heavy features once, light layers per iteration, annealing in one go.
+"""The learned modules: heavy features once, light layers per iteration, annealing all at once.
 
-Parameters of the L iterations are stacked on a leading axis. Shapes below: n, m points of a cloud,
-k neighbors, d = 96 channels, L iterations.
+The parameters of the L iterations are stacked along a leading axis. Shapes below: n, m points of
+the clouds, k neighbors, d = 96 channels, L iterations.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from jaxtyping import Array, Bool, Float
 from cfr_jax.networks.annealing import AnnealingNet
 from cfr_jax.networks.extraction import Activations, pooled_features
 from cfr_jax.networks.layers import GROUPS, Layer, group_norm, kernel_init, unit_rows
+from cfr_jax.networks.record import Params
 
 CHANNELS = 96
 RAW_CHANNELS = 7
 
-# As `kernel_init`, for parameters that are stacked on a leading axis.
+# Like `kernel_init`, for parameters stacked along a leading axis.
 _stacked_init = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform", batch_axis=(0,))
 
 
@@ -49,11 +50,10 @@ class PointFeatures(nn.Module):
 
 
 class Cascade(nn.Module):
-    """The light layers (QMLP), one per iteration, each with parameters of its own, or one `shared`
-    by all of them.
+    """The light layers (QMLP): one per iteration with its own parameters, or one `shared` by all.
 
-    Layer i turns the features that layer i - 1 left, and where the points are now, into features to
-    match: f <- normalize(A relu(groupnorm(f + B x)) + a).
+    Layer i takes the features from layer i - 1 and the current positions x of the points, and
+    returns the features to match: f <- normalize(A relu(groupnorm(f + B x)) + a).
     """
 
     iterations: int
@@ -61,11 +61,11 @@ class Cascade(nn.Module):
 
     def setup(self) -> None:
         count, d = 1 if self.shared else self.iterations, CHANNELS
-        self.position = self.param("position", _stacked_init, (count, 3, d))
-        self.scale = self.param("scale", nn.initializers.ones, (count, d))
-        self.shift = self.param("shift", nn.initializers.zeros, (count, d))
-        self.kernel = self.param("kernel", _stacked_init, (count, d, d))
-        self.bias = self.param("bias", nn.initializers.zeros, (count, d))
+        self.position: Array = self.param("position", _stacked_init, (count, 3, d))
+        self.scale: Array = self.param("scale", nn.initializers.ones, (count, d))
+        self.shift: Array = self.param("shift", nn.initializers.zeros, (count, d))
+        self.kernel: Array = self.param("kernel", _stacked_init, (count, d, d))
+        self.bias: Array = self.param("bias", nn.initializers.zeros, (count, d))
 
     def layer(
         self,
@@ -74,7 +74,7 @@ class Cascade(nn.Module):
         points: Float[Array, "n 3"],
         mask: Bool[Array, " n"] | None = None,
     ) -> Float[Array, "n d"]:
-        """Layer `i` (from 0) alone; unit rows."""
+        """Layer `i` (from 0) alone; the rows of the result have length one."""
         i = 0 if self.shared else i
         moved = features + points @ self.position[i]
         hidden = nn.relu(group_norm(moved, self.scale[i], self.shift[i], groups=GROUPS, mask=mask))
@@ -86,7 +86,7 @@ class Cascade(nn.Module):
         points: Float[Array, "n 3"],
         mask: Bool[Array, " n"] | None = None,
     ) -> Float[Array, "L n d"]:
-        """All layers in a row for a cloud that does not move: the reference."""
+        """All layers, one after the other, for a cloud that does not move: the target."""
         every = []
         for i in range(self.iterations):
             features = self.layer(i, features, points, mask)
@@ -95,23 +95,23 @@ class Cascade(nn.Module):
 
 
 class CFR(nn.Module):
-    """Cascading feature extraction: the three learned parts under one roof."""
+    """Cascading feature extraction: the three learned parts in one module."""
 
     iterations: int = 5
     shared: bool = False
 
     def setup(self) -> None:
-        self.features = PointFeatures()
-        self.cascade = Cascade(self.iterations, self.shared)
-        self.annealing = AnnealingNet(self.iterations)
+        self.features: PointFeatures = PointFeatures()
+        self.cascade: Cascade = Cascade(self.iterations, self.shared)
+        self.annealing: AnnealingNet = AnnealingNet(self.iterations)
 
     def __call__(self, raw: Array, source: Array, target: Array) -> object:
-        """Touches every part once, so that `init` makes all parameters."""
+        """Runs every part once, so that `init` makes all parameters."""
         features = self.features(raw)
         return self.cascade.at_rest(features, source), self.annealing(source, target)
 
 
-def init_params(key: jax.Array, iterations: int = 5, shared: bool = False) -> dict:
-    """Fresh parameters, a pytree of float32 arrays; `shared`: one light layer for all of them."""
+def init_params(key: jax.Array, iterations: int = 5, shared: bool = False) -> Params:
+    """Fresh parameters, a pytree of float32 arrays; if `shared`, with only one light layer."""
     points, raw = jnp.zeros((2, 3)), jnp.zeros((2, 1, RAW_CHANNELS))
     return CFR(iterations, shared).init(key, raw, points, points)["params"]

@@ -1,4 +1,4 @@
-"""The record of CFR: what the table of networks says of it."""
+"""The record of CFR for the table of networks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from cfr_jax.networks.parts import (
     on_host,
 )
 from cfr_jax.networks.probability import uncalibrated
-from cfr_jax.networks.record import Checkpoint, Network, Part, Place, places_of
+from cfr_jax.networks.record import Checkpoint, Network, Params, Part, Place, places_of
 
 # Tracing takes a time that grows with them, and files may claim any number.
 MOST_ITERATIONS = 100
@@ -41,7 +41,7 @@ _LAYERS = (
     ("feat_extractor_ball.prepool.7", "features/scale_2", "features/shift_2"),
 )
 _LAYERS_PER_ITERATION = (
-    # one of each for every iteration {}, stacked here on a leading axis
+    # one of each per iteration {}; here they are stacked along a leading axis
     ("feat_extractor_xyz.nets_a.{}.0", "cascade/scale", "cascade/shift"),
     ("feat_extractor_xyz.nets_a.{}.2", "cascade/kernel", "cascade/bias"),
     ("feat_extractor_xyz.nets_b.{}.0", "cascade/position", None),
@@ -51,7 +51,7 @@ _PREFIXES = ("feat_extractor_ball.", "feat_extractor_xyz.")
 
 
 def _trained(neighbors: int, iterations: int) -> Settings:
-    # how many iterations there are stands in the parameters
+    # the number of iterations follows from the parameters
     return Settings(neighbors=neighbors, detach_motion=True)
 
 
@@ -111,8 +111,8 @@ def check_params(params: Any) -> None:
             raise ValueError(f"params: got a {kind} as {name}, {wanted}")
 
 
-def parts(params: dict, settings: Settings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
-    """All parts of the registration of two clouds, for timing."""
+def parts(params: Params, settings: Settings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
+    """A function that yields all parts of the registration of two clouds, for timing."""
     network, count = bind(params), iterations_of(params)
     heavy = jax.jit(lambda cloud: heavy_features(network, cloud, settings))
     light = jax.jit(lambda *cloud: network.cascade.at_rest(*cloud))
@@ -153,7 +153,7 @@ NETWORK = Network(
     validated=Settings(),
     iterations=iterations_of,
     variants=("shared",),
-    # not those of the phases, of all training, and of its precision
+    # all but those set by the phases (neighbors), by training itself, and by its precision
     changeable=tuple(
         field.name
         for field in dataclasses.fields(Settings)

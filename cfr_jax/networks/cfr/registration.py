@@ -1,8 +1,8 @@
 """`register`: two clouds in, the rigid motion of each iteration out.
 
-A pure function of arrays: it jits, vmaps, and differentiates with respect to parameters and clouds.
-Clouds are expected about the size of the unit sphere, where the network was trained; `align` brings
-any pair there and back.
+A pure function of arrays: use it under `jit` and `vmap`, and differentiate it with respect to
+parameters and clouds. The network was trained on clouds about the size of the unit sphere, and
+expects such clouds. `align` takes clouds of any size and place and converts both ways.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from cfr_jax.networks.cfr.network import check_params
 from cfr_jax.networks.clues import NetworkClues, of_network, of_registration
 from cfr_jax.networks.inputs import Cloud, Settings, check_points, prepare
 from cfr_jax.networks.probability import calibration_of
+from cfr_jax.networks.record import Params
 
 
 @struct.dataclass
 class Registration:
-    """Answer of `register`."""
+    """The answer of `register`."""
 
     transforms: Float[Array, "L 4 4"]
-    """One motion per iteration, cascade after cascade, each from the source as given onto the
+    """One motion per iteration, cascade after cascade. Each maps the source as given onto the
     target."""
     weights: Float[Array, " n"]
     """How much of each source point found a partner in the last match, in [0, 1]."""
@@ -40,26 +41,29 @@ class Registration:
     targets: Float[Array, "n 3"]
     """Where the last match puts each source point."""
     beta: Float[Array, " L"]
-    """Annealing: how sharp the match of each of these iterations was."""
+    """Annealing: how sharp the match of each iteration was."""
     alpha: Float[Array, " L"]
-    """Annealing: how far in feature space it reached."""
+    """Annealing: how far in feature space each match reached."""
     clues: NetworkClues
     """What the confidence was estimated from."""
     confidence: Float[Array, ""] | None
-    """Estimated probability, in [0, 1], that `transform` is right to 5 degrees and 0.1; for clouds
-    of unit size and one cascade. None where the parameters carry no calibration."""
+    """Estimated probability, in [0, 1], that `transform` is right to within 5 degrees and 0.1. It
+    holds for clouds of unit size and one cascade. None if the parameters have no calibration."""
 
     @property
     def transform(self) -> Float[Array, "*batch 4 4"]:
-        """The last motion; maps source onto target. Batched as `transforms` is, after `vmap`."""
+        """The last motion; maps source onto target. After `vmap`, batched like `transforms`."""
         return self.transforms[..., -1, :, :]
 
 
 def encode(
-    params: dict, target: Float[Array, "m c"] | Cloud, *, settings: Settings = Settings()
+    params: Params, target: Float[Array, "m c"] | Cloud, *, settings: Settings = Settings()
 ) -> Encoded:
-    """The features of a reference in every iteration; hand it to `register` as the target, with the
-    same settings. Raises ValueError as `register` does."""
+    """The features of a target in every iteration, to reuse it with many sources.
+
+    Pass the result to `register` as the target, with the same settings. Raises ValueError as
+    `register` does.
+    """
     check_params(params)
     clouds = {"target": target}
     finite = _checked(clouds)
@@ -69,12 +73,12 @@ def encode(
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
-def _encode(params: dict, target: Array | Cloud, *, settings: Settings) -> Encoded:
+def _encode(params: Params, target: Array | Cloud, *, settings: Settings) -> Encoded:
     return encoded(params, _prepared("target", target, settings), settings)
 
 
 def register(
-    params: dict,
+    params: Params,
     source: Float[Array, "n c"] | Cloud,
     target: Float[Array, "m c"] | Cloud | Encoded,
     *,
@@ -84,15 +88,20 @@ def register(
 ) -> Registration:
     """Registers `source` onto `target`: `transform @ [x; 1]` lies on the target.
 
-    Clouds are raw arrays, (n, 3) or with normals (n, 6), or prepared (`prepare`, for masks and
-    neighbors of your own); a target may be encoded beforehand. Iteration i runs i Sinkhorn passes.
-    `iterations` may be anything from 1; beyond the L of the parameters, the last layer is repeated
-    on the features it was trained to receive, with its own annealing and L passes: the cloud moves
-    on, the features only follow its position. Each of the `cascades` is all of this, started where
-    the one before it ended: features and annealing see the clouds nearly aligned then, for the
-    time of another registration onto an encoded target. Differentiates through everything but the
-    choice of neighbors. Raises ValueError on wrong shapes, and for values that are no finite
-    numbers, where they can be seen: inside `jit` and `vmap` they cannot, and NaN in gives NaN out.
+    Clouds are raw arrays, (n, 3) or (n, 6) with normals, or the results of `prepare`, which takes
+    masks and your own neighbors. The target may also be the result of `encode`. Iteration i runs i
+    Sinkhorn passes.
+
+    `iterations` may be any number from 1. Beyond the L iterations of the parameters, the last layer
+    is repeated on the features it was trained to receive, with its own annealing and L passes: the
+    cloud keeps moving, and the features only follow its position. Each of the `cascades` does all
+    of this again, starting where the previous one ended. Features and annealing then see clouds
+    that are nearly aligned. A further cascade takes as long as another registration onto an encoded
+    target.
+
+    Gradients flow through everything but the choice of neighbors. Raises ValueError for wrong
+    shapes and for values that are not finite. Inside `jit` and `vmap` the values are not known, and
+    NaN in gives NaN out.
     """
     check_params(params)
     for name, count in (("iterations", iterations), ("cascades", cascades)):
@@ -109,7 +118,7 @@ def register(
 
 @functools.partial(jax.jit, static_argnames=("iterations", "cascades", "settings"))
 def _register(
-    params: dict,
+    params: Params,
     source: Array | Cloud,
     target: Array | Cloud | Encoded,
     *,
@@ -141,7 +150,7 @@ def _register(
         }
         return transforms[-1], found
 
-    # a loop, since it is compiled once however many there are
+    # a loop, so that the cascade is compiled only once
     start = jnp.eye(4, dtype=jnp.result_type(source.points, reference.cloud.points))
     found = lax.scan(cascade, start, length=cascades)[1]
     of_all = {name: jnp.concatenate(found[name]) for name in ("transforms", "beta", "alpha")}
@@ -167,8 +176,11 @@ def _prepared(name: str, cloud: Array | Cloud, settings: Settings) -> Cloud:
 
 
 def _checked(clouds: dict[str, Any]) -> Array | None:
-    """Refuses what a compiled function cannot tell, where it is known by now. What is on the device
-    stays there: the answer is one flag that it makes, whether those values are finite."""
+    """Checks what a compiled function cannot check, as far as the values are known by now.
+
+    Clouds on the device stay there. For them the device computes one flag, which this returns:
+    whether all of their values are finite.
+    """
     on_device = []
     for name, cloud in clouds.items():
         if isinstance(cloud, Cloud | Encoded | jax.core.Tracer):
@@ -185,7 +197,7 @@ def _checked(clouds: dict[str, Any]) -> Array | None:
             _check_finite(name, cloud)
         else:
             on_device.append(cloud)
-    with jax.ensure_compile_time_eval():  # while a caller is traced, what it knows has its values
+    with jax.ensure_compile_time_eval():  # concrete arrays have values even in a traced caller
         return _all_finite(on_device) if on_device else None
 
 
@@ -195,8 +207,11 @@ def _all_finite(clouds: list[Array]) -> Array:
 
 
 def _refuse_unless(finite: Array | None, clouds: dict[str, Any]) -> None:
-    """Raises ValueError for values on the device that are not finite. To be asked when the work has
-    been handed to the device: only the flag is waited for, and rows are fetched for the message."""
+    """Raises ValueError if values on the device are not finite.
+
+    Call this after the work was sent to the device: it waits for the flag alone. Rows are fetched
+    only for the message.
+    """
     if finite is not None and not jax.device_get(finite):
         for name, cloud in clouds.items():
             if isinstance(cloud, jax.Array) and not isinstance(cloud, jax.core.Tracer):
@@ -207,5 +222,6 @@ def _check_finite(name: str, cloud: np.ndarray) -> None:
     wrong = np.flatnonzero(~np.isfinite(cloud).all(axis=1))
     if len(wrong):
         raise ValueError(
-            f"{name}: row {wrong[0]} is not finite, and {len(wrong) - 1} more; wanted numbers"
+            f"{name}: row {wrong[0]} is not finite, and {len(wrong) - 1} more; "
+            "wanted finite numbers"
         )

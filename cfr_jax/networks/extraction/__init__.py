@@ -1,22 +1,23 @@
 """The heavy part: a shared MLP on every neighbor of every point, pooled by maximum.
 
-Three layers of Linear, GroupNorm and ReLU see n k rows per cloud, and the norm's statistics run
-over all of them, so the plain form writes and reads n k 96 floats eight times, and four times that
-for its gradient. Here tiles of points stay in a CPU's cache, and at most one such array is ever
-stored; to an accelerator the whole cloud is one tile.
+Three layers of Linear, GroupNorm and ReLU process n k rows per cloud. The statistics of the norm
+run over all of these rows, so the plain form writes and reads n k 96 floats eight times, and four
+times as often for its gradient. Here, tiles of points stay in the CPU's cache, and at most one such
+array is ever stored. On an accelerator the whole cloud is one tile.
 
 - The first layer's statistics follow exactly from the mean and covariance of the seven raw
   channels.
-- One pass over the tiles sums the second layer's output for its statistics, and keeps it, as far as
-  the limits allow; beyond, it is made again when it is needed.
+- One pass over the tiles sums the second layer's output for its statistics. It stores the output up
+  to the limits; the rest is recomputed when it is needed.
 - A second pass sums the third layer's output and keeps its largest value over the neighbors. The
   norm and the ReLU are monotonic per channel, so the pooled feature is that value, normalized.
-  (Where the norm's scale is negative it is the smallest value: the sign is folded into the
+  (Where the norm's scale is negative, it is the smallest value: the sign is folded into the
   weights.)
 
-The gradient is written out for the same reason. Through a norm it is the incoming gradient minus
-its projections on 1 and on the normalized values, and both projections are sums over rows: the last
-layer's follow from the pooled values alone, the first layer's from sums of seven channels.
+The gradient is written by hand for the same reason. The gradient through a norm is the incoming
+gradient minus its projections on 1 and on the normalized values. Both projections are sums over
+rows. For the last layer they follow from the pooled values alone, for the first layer from sums of
+seven channels.
 """
 
 from __future__ import annotations
@@ -52,13 +53,13 @@ def pooled_features(
     on_cpu: Limits = CPU,
     elsewhere: Limits = ACCELERATOR,
 ) -> Float[Array, "n d"]:
-    """Per-neighbor MLP and maximum over the neighbors, one feature per point.
+    """An MLP on every neighbor, then the maximum over the neighbors: one feature per point.
 
-    Rows of masked points enter no statistic; their own features are zero. Differentiates by its own
-    rule, once, with memory for one activation (at most `on_cpu.kept` numbers of it) and its
-    gradient. The platform that the program is lowered for decides between the limits. `activations`
-    says what the values between the layers are rounded to and multiplied in: for "bfloat16" see
-    `mixed`.
+    Masked points do not affect the statistics, and their own features are zero. The gradient has a
+    rule of its own. It can be taken once, and needs memory for one activation (at most
+    `on_cpu.kept` numbers of it) and its gradient. The platform that the program is lowered for
+    decides which limits apply. `activations` is the type in which the values between the layers are
+    stored and multiplied; for "bfloat16" see `mixed`. Raises ValueError for any other type.
     """
     n = raw.shape[0]
     valid = jnp.ones(n, raw.dtype) if mask is None else mask.astype(raw.dtype)
@@ -83,7 +84,7 @@ def _pooled_fwd(
     layers: _Layers, raw: Array, valid: Array, groups: int, limits: tuple[Limits, ...]
 ) -> tuple[Array, tuple[_Layers, Array, Array, Kept]]:
     n, k, _ = raw.shape
-    # as many rows on every platform, since it is one program until it is lowered
+    # the same number of rows on every platform: until it is lowered, this is one program
     tiling = tiling_of(n, k, limits[0])
     rows_kept = kept_of(tiling, k, layers[1].bias.size, limits[0]) * tiling.size * k
     ways = (functools.partial(forward, groups=groups, limits=one, rows_kept=rows_kept)

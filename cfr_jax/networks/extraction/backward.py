@@ -11,7 +11,7 @@ from cfr_jax.networks.extraction.forward import Kept
 from cfr_jax.networks.extraction.tiles import Limits, cut, cut_rows, scan, tiling_of
 from cfr_jax.networks.layers import Layer, fold, projections
 
-_HIGHEST = lax.Precision.HIGHEST  # for the raw channels, as forward
+_HIGHEST = lax.Precision.HIGHEST  # for the raw channels, as in `forward`
 
 
 def backward(
@@ -24,7 +24,7 @@ def backward(
     groups: int,
     limits: Limits,
 ) -> tuple[tuple[Layer, Layer, Layer], Float[Array, "n k c"], Float[Array, " n"]]:
-    """Gradients of the layers, of the raw channels, and none (zeros) of `valid`."""
+    """Gradients with respect to the layers, the raw channels, and `valid` (zeros)."""
     one, two, three = layers
     (norm_one, norm_two, norm_three), normal, second = kept
     n, k, channels = raw.shape
@@ -32,7 +32,7 @@ def backward(
     tiling = tiling_of(n, k, limits)
     tiles = cut_rows(raw, tiling)
     weights = jnp.repeat(cut(valid, tiling), k, axis=1)
-    # what was kept serves where it fills whole tiles
+    # only what fills whole tiles can be reused
     some = min(tiling.number, len(second) // tiles.shape[1])
     second = second[: some * tiles.shape[1]].reshape(some, tiles.shape[1], two.bias.size)
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
@@ -47,8 +47,8 @@ def backward(
     def normal_two(z: Array) -> Array:
         return (z + (two.bias - norm_two.mean)) * norm_two.rate
 
-    # Third norm: only the extreme of each point receives gradient, so its projections are sums over
-    # n.
+    # Third norm: only the extreme value of each point receives a gradient, so the projections are
+    # sums over n.
     alive = normal * three.scale + three.shift > 0
     gradient = jnp.where(alive, gradient, 0) * valid[:, None]
     shift_three, scale_three = gradient.sum(0), (gradient * normal).sum(0)
@@ -106,7 +106,7 @@ def backward(
     (kernel_two, bias_two, shift_one, outer), d_raw = scan(
         through_two, sums, second, again, tiles, weights, d_two
     )
-    # First layer: its normalized output is linear in the raw channels, and so is all that remains.
+    # First layer: its normalized output is linear in the raw channels, so the rest is linear too.
     slope, offset = one.kernel * norm_one.rate, (one.bias - norm_one.mean) * norm_one.rate
     scale_one = (slope * outer).sum(0) + offset * shift_one
     flat_one, tilt_one = projections(one, shift_one, scale_one, rows, groups)

@@ -9,20 +9,21 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from cfr_jax.networks.extraction import whole
 from cfr_jax.networks.extraction.tiles import Limits, cut, cut_rows, each, kept_of, scan, tiling_of
 from cfr_jax.networks.layers import Layer, Norm, fold, norm_of
 
-_HIGHEST = lax.Precision.HIGHEST  # for what becomes a variance
+_HIGHEST = lax.Precision.HIGHEST  # for products that become variances
 
 
 class Kept(NamedTuple):
-    """What the gradient needs of the values."""
+    """What the forward pass keeps for the gradient."""
 
     norms: tuple[Norm, Norm, Norm]
     normal: Float[Array, "n d"]
     """The pooled values, normalized, before scale and shift."""
     second: Float[Array, "rows d"]
-    """The second layer's output, bias left out, of the first so many rows."""
+    """The second layer's output without its bias, for the first `rows` rows."""
 
 
 def forward(
@@ -34,15 +35,18 @@ def forward(
     limits: Limits,
     rows_kept: int,
 ) -> tuple[Float[Array, "n d"], Kept]:
-    """The pooled features, and what is kept for the gradient, of the second layer's output
-    `rows_kept` rows; all of it finite, whatever is valid."""
+    """The pooled features, and what the gradient needs, including `rows_kept` rows of the second
+    layer's output. Everything is finite, even if no point is valid."""
     n = raw.shape[0]
     widths = [layer.bias.size for layer in layers]
 
+    at_once = limits.at_once > 1 and tiling_of(n, raw.shape[1], limits).number == 1
+
     def of_points() -> tuple[Array, Kept]:
-        pooled, kept = _forward(layers, raw, valid, groups, limits)
+        run = _of_whole if at_once else _of_tiles
+        pooled, kept = run(layers, raw, valid, groups, limits)
         second = kept.second.reshape(-1, widths[1])[:rows_kept]
-        more = rows_kept - len(second)  # where another platform's tiles hold more padding
+        more = rows_kept - len(second)  # the tiles of another platform may hold more padding
         return pooled, kept._replace(second=jnp.pad(second, ((0, more), (0, 0))))
 
     def of_none() -> tuple[Array, Kept]:
@@ -53,14 +57,21 @@ def forward(
     if limits.at_once > 1:
         return of_points()  # an accelerator would have to ask the host which branch to take
 
-    # To XLA's scheduler a branch is one operation: so on a CPU the clouds of a pair come one after
-    # the other and take the same scratch. (The barrier hides from it that without a mask all are
-    # valid.)
+    # To XLA's scheduler a branch is one operation. So on a CPU the two clouds of a pair run one
+    # after the other and share their scratch memory. (Without a mask all points are valid; the
+    # barrier hides this from XLA, which would otherwise remove the branch.)
     some = jnp.any(lax.optimization_barrier(valid) > 0)
     return lax.cond(some, of_points, of_none)
 
 
-def _forward(
+def _of_whole(
+    layers: tuple[Layer, Layer, Layer], raw: Array, valid: Array, groups: int, _: Limits
+) -> tuple[Array, Kept]:
+    pooled, values = whole.forward(layers, raw, valid, groups=groups, stored=raw.dtype)
+    return pooled, Kept(values.norms, values.normal, values.z_two)
+
+
+def _of_tiles(
     layers: tuple[Layer, Layer, Layer], raw: Array, valid: Array, groups: int, limits: Limits
 ) -> tuple[Array, Kept]:
     one, two, three = layers
@@ -75,8 +86,8 @@ def _forward(
     def second(raw: Array) -> Array:
         return jax.nn.relu(raw @ kernel_one + bias_one) @ two.kernel
 
-    # Both passes leave sums per point, and the mask weighs them afterwards: reductions that follow
-    # a product directly are fused into it on CPU.
+    # Both passes produce sums per point, and the mask is applied afterwards: on a CPU, a reduction
+    # that directly follows a product is fused into it.
     def statistics(_: None, raw: Array) -> tuple[None, tuple[Array, tuple[Array, Array]]]:
         z = second(raw)
         return None, (z, _sums_of_neighbors(z, k))
@@ -122,7 +133,7 @@ def _moments(
 def _moments_of_first(
     layer: Layer, tiles: Array, weights: Array, rows: Array
 ) -> tuple[Array, Array]:
-    # tile by tile: on CPU the product copies what it is made of
+    # tile by tile: on a CPU the product copies its operands
     channels = tiles.shape[-1]
     neighbors = tiles.reshape(*weights.shape, -1, channels)
     mean = jnp.sum(weights[:, :, None, None] * neighbors, (0, 1, 2)) / rows

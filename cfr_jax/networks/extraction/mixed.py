@@ -1,12 +1,13 @@
 """The MLP and its maximum with activations in bfloat16: half the memory traffic on accelerators.
 
-On a GPU the MLP waits for memory, not for arithmetic. So here a whole cloud goes by at once, each
-layer's values are stored once, in two bytes, and nothing is made twice. Products take bfloat16 in
-and sum in float32; norms, their statistics, and the gradients of the weights are float32.
+On a GPU the MLP is limited by memory, not by arithmetic. So this form processes a whole cloud at
+once, stores the values of each layer once, in two bytes each, and recomputes nothing. Products take
+bfloat16 inputs and accumulate in float32. The norms, their statistics, and the gradients of the
+weights are float32.
 
-The gradient is that of `backward`, with two differences. Ties at the maximum are frequent, as
-bfloat16 has eight bits: they share the gradient. And sums that follow from the moments of the
-forward pass are not summed again.
+The gradient is that of `backward`, with two differences. Ties at the maximum are frequent, because
+bfloat16 has eight bits of precision; tied values share the gradient. And sums that follow from the
+moments of the forward pass are not computed again.
 """
 
 from __future__ import annotations
@@ -15,23 +16,16 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import lax
 from jax.experimental.layout import Layout, with_layout_constraint
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from cfr_jax.networks.layers import Layer, Norm, fold, norm_of, projections
+from cfr_jax.networks.extraction.whole import Values, forward
+from cfr_jax.networks.layers import Layer, Norm, projections
 
 _Layers = tuple[Layer, Layer, Layer]
-_Kept = tuple[
-    tuple[Array, Array, Array, Array], tuple[Norm, Norm, Norm],
-    Array, Array, Array, Array, Array, Array,
-]  # fmt: skip
-"""Means and a covariance, norms, what was pooled, and the layers' inputs and outputs."""
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
 def pooled_mixed(
     layers: tuple[Layer, Layer, Layer],
     raw: Float[Array, "n k c"],
@@ -39,53 +33,38 @@ def pooled_mixed(
     groups: int,
     stored: DTypeLike = jnp.bfloat16,
 ) -> Float[Array, "n d"]:
-    """`extraction.pooled_features` of the points that are `valid` (1, or 0), before the others are
-    set to zero. Differentiates by its own rule, once. `stored` is what activations are kept in."""
+    """`extraction.pooled_features`, except that features of invalid points are not yet zero.
+
+    `valid` is 1 for valid points and 0 for the others. `stored` is the type of the activations. The
+    gradient has a rule of its own and can be taken once.
+    """
+    return _pooled(layers, raw, valid, groups, stored)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _pooled(layers: _Layers, raw: Array, valid: Array, groups: int, stored: DTypeLike) -> Array:
     return _forward(layers, raw, valid, groups, stored)[0]
 
 
 def _forward(
     layers: _Layers, raw: Array, valid: Array, groups: int, stored: DTypeLike
-) -> tuple[Array, tuple[_Layers, Array, Array, _Kept]]:
-    one, two, three = layers
-    count = jnp.maximum(jnp.sum(valid) * raw.shape[1], 1)
-
-    mean, covariance = _moments_of_raw(raw, valid, count)
-    spread = ((covariance @ one.kernel) * one.kernel).sum(0)
-    norm_one = norm_of(mean @ one.kernel + one.bias, spread, groups)
-    kernel_one, bias_one = fold(one, norm_one)
-    # a channel of ones carries the bias; with it there are eight, as matrix units want
-    x = jnp.pad(raw, ((0, 0), (0, 0), (0, 1)), constant_values=1).astype(stored)
-    y_one = jax.nn.relu(x @ jnp.vstack([kernel_one, bias_one]).astype(stored))
-    y_one = lax.optimization_barrier(y_one)
-
-    z_two = y_one @ two.kernel.astype(stored)
-    mean_two, norm_two = _norm(z_two, valid, count, two.bias, groups)
-    gain, level = _affine(two, norm_two)
-    y_two = jax.nn.relu(z_two.astype(raw.dtype) * gain + level).astype(stored)
-
-    # under a negative scale the smallest value becomes the largest
-    sign = jnp.where(three.scale >= 0, 1, -1).astype(raw.dtype)
-    z_three = y_two @ (three.kernel * sign).astype(stored)
-    high = z_three.max(1).astype(raw.dtype)
-    mean_three, norm_three = _norm(z_three, valid, count, three.bias, groups, sign)
-    normal = (high * sign + three.bias - norm_three.mean) * norm_three.rate
-    pooled = jax.nn.relu(normal * three.scale + three.shift)
-    norms = (norm_one, norm_two, norm_three)
-    kept = (mean, covariance, mean_two, mean_three), norms, normal, x, y_one, z_two, y_two, z_three
-    return pooled, (layers, raw, valid, kept)
+) -> tuple[Array, tuple[_Layers, Array, Array, Values]]:
+    pooled, values = forward(layers, raw, valid, groups=groups, stored=stored)
+    return pooled, (layers, raw, valid, values)
 
 
 def _backward(
-    groups: int, stored: DTypeLike, residuals: tuple[_Layers, Array, Array, _Kept], gradient: Array
+    groups: int, stored: DTypeLike, residuals: tuple[_Layers, Array, Array, Values], gradient: Array
 ) -> tuple[_Layers, Array, Array]:
-    (one, two, three), raw, valid, kept = residuals
-    (mean, covariance, mean_two, mean_three), norms, normal, x, y_one, z_two, y_two, z_three = kept
+    (one, two, three), raw, valid, values = residuals
+    means, covariance, norms, normal, x, y_one, z_two, y_two, z_three = values
+    mean, mean_two, mean_three = means
     norm_one, norm_two, norm_three = norms
     count = jnp.maximum(jnp.sum(valid) * raw.shape[1], 1)
     weight = valid[:, None, None]
 
-    # Third layer: the maximum of each point has a gradient, all others what the norm takes out.
+    # Third layer: the maximum of each point receives the gradient; all other values receive only
+    # what the norm takes out.
     gradient = jnp.where(normal * three.scale + three.shift > 0, gradient, 0) * valid[:, None]
     shift_three, scale_three = gradient.sum(0), (gradient * normal).sum(0)
     flat, tilt = projections(three, shift_three, scale_three, count, groups)
@@ -116,7 +95,7 @@ def _backward(
     kernel_two = _over_rows(y_one, d_z)
     d_y = d_z @ two.kernel.astype(stored).T
 
-    # First layer: its normalized output is linear in the raw channels, and so is all that remains.
+    # First layer: its normalized output is linear in the raw channels, so the rest is linear too.
     d_n = jnp.where(y_one > 0, d_y, 0)
     outer = _over_rows(x, d_n)
     outer, shift_one = outer[:-1], outer[-1]
@@ -137,37 +116,11 @@ def _backward(
     return gradients, d_raw, jnp.zeros_like(valid)
 
 
-pooled_mixed.defvjp(_forward, _backward)
-
-
-def _moments_of_raw(raw: Array, valid: Array, count: Array) -> tuple[Array, Array]:
-    """Mean and covariance of the raw channels. Summed, not multiplied: a product of so few columns
-    leaves a GPU's units empty, and would be rounded there."""
-    weight = valid[:, None, None]
-    mean = _sum(raw * weight) / count
-    centered = raw - mean
-    channels = raw.shape[-1]
-    row, column = np.triu_indices(channels)
-    sums = _sum(centered[..., row] * centered[..., column] * weight) / count
-    place = np.zeros((channels, channels), np.int32)
-    place[row, column] = place[column, row] = np.arange(len(row))
-    return mean, sums[place]
-
-
-def _norm(
-    z: Array, valid: Array, count: Array, bias: Array, groups: int, sign: Array | int = 1
-) -> tuple[Array, Norm]:
-    """Mean of each channel of z sign + bias, and the norm."""
-    values = z.astype(bias.dtype)  # on its way into the sums
-    total, square = (
-        _sum(each * valid[:, None, None]) / count for each in (values, values * values)
-    )
-    mean = total * sign + bias
-    return mean, norm_of(mean, square - total * total, groups)
+_pooled.defvjp(_forward, _backward)
 
 
 def _sum(values: Array) -> Array:
-    """Over points and neighbors: over the neighbors first, next to each other in memory."""
+    """The sum over points and neighbors; neighbors first, as they are adjacent in memory."""
     return with_layout_constraint(values, Layout((0, 1, 2))).sum((0, 1))
 
 
@@ -183,6 +136,6 @@ def _normalizing(norm: Norm, bias: Array) -> tuple[Array, Array]:
 
 
 def _over_rows(left: Array, right: Array) -> Array:
-    """left' right over all rows, summed in float32."""
+    """left' right over all rows, accumulated in float32."""
     left, right = (rows.reshape(-1, rows.shape[-1]) for rows in (left, right))
     return jnp.matmul(left.T, right, preferred_element_type=jnp.float32)

@@ -1,4 +1,4 @@
-"""Tiles of rows, as many at a time as a platform likes, and what is kept between two passes."""
+"""Tiles of rows, sized for the platform, and what is kept between two passes."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from jaxtyping import Array, Float
 
 
 class Limits(NamedTuple):
-    """How large a step is, and how much is kept."""
+    """How large a step is, and how much of the second layer's output is kept."""
 
     rows: int = 4096
-    """Of a tile, neighbor by neighbor. On a CPU a tile's activations stay in a cache: rows of 96
-    floats, two or three of them at a time forward, about eight backward."""
+    """Rows of a tile, one per neighbor. On a CPU the activations of a tile stay in the cache: two
+    or three arrays of 96 floats per row at a time in the forward pass, about eight in the backward
+    pass."""
     kept: int = 9 << 19
-    """Numbers of the second layer's output that are kept, 18 MiB. Made again they cost half of what
-    the rest of the forward pass does; but a program with more than 32 MiB of scratch is given it
-    anew in each call, page by page (glibc), which costs more than is saved."""
+    """How many numbers of the second layer's output are kept: 18 MiB. To recompute them costs half
+    as much as the rest of the forward pass. But if a program needs more than 32 MiB of scratch
+    memory, glibc maps it again in every call, page by page, and that costs more than it saves."""
     at_once: int = 1
-    """Tiles that are one step. An accelerator wants the whole cloud in one: steps of a loop are
-    kernels that each have too little to do."""
+    """Tiles per step. An accelerator wants the whole cloud in one step: the kernels of a loop's
+    steps would each have too little to do."""
 
 
 CPU = Limits()
-# 2 million rows: 32,000 points with 64 neighbors, 0.8 GiB an activation; 2 GiB are kept
+# 2 million rows: 32,000 points with 64 neighbors, 0.8 GiB per activation; 2 GiB are kept
 ACCELERATOR = Limits(kept=1 << 29, at_once=512)
 
 
@@ -47,19 +48,19 @@ def tiling_of(n: int, k: int, limits: Limits) -> Tiling:
 
 
 def kept_of(tiling: Tiling, k: int, width: int, limits: Limits) -> int:
-    """How many of the tiles are kept in a layer of that width."""
+    """How many of the tiles are kept, for a layer of this width."""
     return max(1, min(tiling.number, limits.kept // (tiling.size * k * width)))
 
 
 def cut(values: Array, tiling: Tiling) -> Array:
-    """Points (n, ...) cut into tiles (count, size, ...), padded to whole ones."""
+    """Points (n, ...) cut into tiles (count, size, ...); the last tile is padded."""
     more = tiling.number * tiling.size - values.shape[0]
     padded = jnp.pad(values, [(0, more)] + [(0, 0)] * (values.ndim - 1))
     return padded.reshape(*tiling, *values.shape[1:])
 
 
 def cut_rows(raw: Float[Array, "n k c"], tiling: Tiling) -> Float[Array, "count rows c"]:
-    """The same, neighbor by neighbor."""
+    """Neighbors (n, k, c) cut into tiles (count, size k, c): one row per neighbor."""
     return cut(raw, tiling).reshape(tiling.number, -1, raw.shape[-1])
 
 
@@ -71,8 +72,11 @@ def scan(
     tiles: Float[Array, "count rows c"],
     *others: Array,
 ) -> tuple[Any, Any]:
-    """`lax.scan` of step(state, z, raw, *others) over all tiles, where z is the second layer's
-    output: kept of the first tiles, made `again` from the raw channels of the rest."""
+    """`lax.scan` of step(state, z, raw, *others) over all tiles.
+
+    z is the second layer's output: `kept` for the first tiles, recomputed by `again` from the raw
+    channels for the rest.
+    """
     some = kept.shape[0]
     first, rest = ([x[part] for x in (tiles, *others)] for part in (slice(some), slice(some, None)))
     results = []
@@ -86,7 +90,7 @@ def scan(
 
 
 def each(step: Callable[[Any, Any], tuple[Any, Any]], state: Any, tiles: Any) -> tuple[Any, Any]:
-    """`lax.scan`, without a loop where there is but one tile."""
+    """`lax.scan`, but without a loop if there is only one tile."""
     if len(jax.tree.leaves(tiles)[0]) > 1:
         return lax.scan(step, state, tiles)
     state, result = step(state, jax.tree.map(lambda tile: tile[0], tiles))

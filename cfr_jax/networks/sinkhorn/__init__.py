@@ -1,14 +1,15 @@
 """Sinkhorn normalization with slack: which source point corresponds to which target point, softly.
 
-A row and a column of ones stand beside the affinities m = exp(log affinity) and take what has no
-partner; they are never normalized themselves. One pass divides every real row by its sum, then
-every real column by its sum, slack included. Several forms give the same numbers: `dense` stores
-the (n, m) block, `streamed` makes it row by row whenever it needs it, `fused` does so inside a
-GPU's kernel, `log_space` is the published one that they are compared with.
+The affinities m = exp(log affinity) get an extra row and column of ones, the slack, for points
+without a partner. The slack row and column are never normalized themselves. One pass divides every
+real row by its sum, then every real column by its sum, slack included. Several forms give the same
+numbers: `dense` stores the (n, m) block, `streamed` recomputes it in blocks of rows whenever it is
+needed, and `log_space` is the published form, to compare with.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 from jaxtyping import Array, Bool, Float
@@ -21,16 +22,15 @@ from cfr_jax.networks.sinkhorn.streamed import rows_of
 
 __all__ = ["FORMS", "Affinity", "Form", "Match", "form_for", "match"]
 
-Form = Literal["auto", "dense", "streamed", "fused", "log space"]
+Form = Literal["auto", "dense", "streamed", "log space"]
 Platform = Literal["cpu", "accelerator"]
 
-# Entries of a block that is still stored, 128 MiB of float32 on a CPU and 2 GiB on an accelerator.
-# Stored, a further pass costs reading the block twice; streamed, making it once more. That is at
-# worst twice as slow on a CPU; on a GPU it is several times as slow, and many more kernels.
+# The most entries that are stored: 128 MiB of float32 on a CPU, 2 GiB on an accelerator. Each
+# further pass reads a stored block twice, and recomputes a streamed block once. On a CPU that is at
+# worst twice as slow; on a GPU it is several times as slow, with many more kernels.
 _STORED: dict[Platform, int] = {"cpu": 1 << 25, "accelerator": 1 << 29}
-# Entries of a block that is streamed, 16 MiB and 256 MiB.
+# Entries of one streamed block of rows: 16 MiB and 256 MiB.
 _STREAMED: dict[Platform, int] = {"cpu": 1 << 22, "accelerator": 1 << 26}
-_TILE = 64  # rows and columns of a kernel's tile
 
 
 def match(
@@ -44,11 +44,11 @@ def match(
 ) -> Match:
     """Normalizes the affinities by `passes` passes and averages `points` with them.
 
-    Finite for every finite affinity. Masked points neither give nor take. `passes` and `form` are
-    static; "auto" decides by the number of entries and the platform that the program is lowered
-    for (`form_for`), of one pair: a batch of large ones is for "streamed". Differentiates with
-    respect to everything but the masks; once, where the form is not "dense" or "log space". Raises
-    ValueError for fewer than one pass, and for a form that does not exist.
+    The result is finite for every finite affinity. Masked points take no part. `passes` and `form`
+    are static. "auto" chooses by the number of entries of one pair and by the platform that the
+    program is lowered for (`form_for`); for a batch of large pairs ask for "streamed". Gradients
+    exist for everything but the masks; with forms other than "dense" and "log space" they can be
+    taken once. Raises ValueError for fewer than one pass and for an unknown form.
     """
     if passes < 1:
         raise ValueError(f"passes: got {passes}, wanted at least 1")
@@ -65,10 +65,6 @@ def form_for(n: int, m: int, platform: Platform) -> Form:
 
 def _match_streamed(affinity: Affinity, points: Array, **rest: Any) -> Match:
     return _by_hand(affinity, points, [_streamed(affinity, each) for each in _STREAMED], **rest)
-
-
-def _match_fused(affinity: Affinity, points: Array, **rest: Any) -> Match:
-    return _by_hand(affinity, points, 2 * [Way("fused", _TILE)], **rest)
 
 
 def _by_hand(affinity: Affinity, points: Array, ways: list[Way], **rest: Any) -> Match:
@@ -91,9 +87,8 @@ def _match_by_size(affinity: Affinity, points: Array, **rest: Any) -> Match:
     return _by_hand(affinity, points, ways, **rest)
 
 
-FORMS = {
+FORMS: dict[Form, Callable[..., Match]] = {
     "dense": match_dense,
     "streamed": _match_streamed,
-    "fused": _match_fused,
     "log space": match_in_log_space,
 }

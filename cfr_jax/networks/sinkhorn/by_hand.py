@@ -1,7 +1,7 @@
-"""The matches whose gradient is written by hand, and which of them a platform runs.
+"""The forms of the match with a hand-written gradient, and the choice between them by platform.
 
-All of them need little memory for it, differentiate once, and leave the same trace, so that a
-program that is not yet lowered can hold one for CPUs and another for the rest.
+Their gradients need little memory and can be taken once. All forms leave the same trace, so a
+program that is not yet lowered can hold one form for CPUs and another for other platforms.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _Masks = tuple[Array, Array]
 
 
 class Way(NamedTuple):
-    """How a platform does it."""
+    """How a platform computes the match."""
 
-    kind: Literal["stored", "streamed", "fused"]
-    """The block in memory; block after block of whole rows; inside a kernel."""
+    kind: Literal["stored", "streamed"]
+    """Stored in memory, or streamed in blocks of whole rows."""
     rows: int
-    """Of a block that is streamed, of a kernel's block."""
+    """Rows of a streamed block; not used if stored."""
 
 
 def match_by_hand(
@@ -40,7 +40,7 @@ def match_by_hand(
     source_mask: Bool[Array, " n"] | None = None,
     target_mask: Bool[Array, " m"] | None = None,
 ) -> Match:
-    """`match` in the way of the platform that the program is lowered for."""
+    """`match`, as suits the platform that the program is lowered for."""
     sizes = affinity.source.shape[0], affinity.target.shape[0]
     of_source, of_target = (
         jnp.ones(size, bool) if mask is None else mask
@@ -64,7 +64,7 @@ def _forward(
     ) -> tuple[Match, scaling.Trace]:
         if way.kind == "streamed":
             return streamed.forward(affinity, points, masks, passes=passes, rows=way.rows)
-        return scaling.forward(_block(way, affinity, masks), points, passes)
+        return scaling.forward(scaling.Stored(affinity, masks), points, passes)
 
     found, trace = _by_platform(run, ways, affinity, points, masks)
     return found, (affinity, points, masks, trace)
@@ -88,24 +88,13 @@ def _backward(
             return streamed.backward(
                 affinity, points, masks, trace, gradient, passes=passes, rows=way.rows
             )
-        block = _block(way, affinity, masks, trace.shift)
+        block = scaling.Stored(affinity, masks, trace.shift)
         return scaling.backward(block, affinity, points, trace, gradient)
 
     return *_by_platform(run, ways, *residuals, gradient), None
 
 
 _match.defvjp(_forward, _backward)
-
-
-def _block(
-    way: Way, affinity: Affinity, masks: _Masks, shift: Array | None = None
-) -> scaling.Block:
-    if way.kind == "fused":
-        # imported here: Pallas takes a quarter of a second that no other form needs
-        from cfr_jax.networks.sinkhorn import fused
-
-        return fused.Fused(affinity, masks, shift, rows=way.rows)
-    return scaling.Stored(affinity, masks, shift)
 
 
 def _by_platform(run: Callable[..., Any], ways: tuple[Way, Way], *arguments: Any) -> Any:

@@ -1,8 +1,8 @@
 """The match with its block of affinities stored, in scaling form.
 
-The normalized block is diag(u) m diag(v), with u <- 1 / (m v + 1) and v <- 1 / (m' u + 1) from
-v = 1: matrix-vector products only, the block itself is read and never rewritten ("log-free",
-Hisadome & Matsui, 2021; scaling form after Cuturi, 2013).
+The normalized block is diag(u) m diag(v), where u <- 1 / (m v + 1) and v <- 1 / (m' u + 1),
+starting from v = 1. These are matrix-vector products only: the block is read and never rewritten
+("log-free", Hisadome & Matsui, 2021; scaling form after Cuturi, 2013).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ def match_dense(
     source_mask: Bool[Array, " n"] | None = None,
     target_mask: Bool[Array, " m"] | None = None,
 ) -> Match:
-    """`match`, the (n, m) block stored.
+    """`match` with the (n, m) block stored.
 
-    Each row is shifted by r = max(0, its largest entry), so that no exponential overflows, and its
+    Each row is shifted by r = max(0, its largest entry), so that no exponential overflows; its
     scaling is kept as u e^r.
     """
     log_values = masked(affinity.log(), source_mask, target_mask)
@@ -36,9 +36,14 @@ def match_dense(
     slack = jnp.exp(-shift)
     tiny = jnp.finfo(block.dtype).tiny
     v = jnp.ones(block.shape[1], block.dtype)
-    for _ in range(passes):
-        # the floor is reached only where a whole row has vanished: it then stays without partner
-        u = 1 / jnp.maximum(jnp.matmul(block, v, precision=_HIGHEST) + slack, tiny)
+    # With the barrier, an accelerator makes the block and the sums of its rows in one kernel.
+    # Without it, XLA stores the logarithms as well, and computes the block from them repeatedly.
+    block, found = lax.optimization_barrier((block, jnp.matmul(block, v, precision=_HIGHEST)))
+    for i in range(passes):
+        if i:
+            found = jnp.matmul(block, v, precision=_HIGHEST)
+        # the floor is reached only if a whole row underflows: that point stays without a partner
+        u = 1 / jnp.maximum(found + slack, tiny)
         found = jnp.matmul(u, block, precision=_HIGHEST)
         v = 1 / (found + 1)
     sums = jnp.matmul(block, v[:, None] * with_ones(points), precision=_HIGHEST)

@@ -1,4 +1,4 @@
-"""The match by log-sum-exp over the padded block, as RPM-Net published it; slower."""
+"""The match by log-sum-exp over the padded block, as published with RPM-Net; slower."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def match_in_log_space(
     source_mask: Bool[Array, " n"] | None = None,
     target_mask: Bool[Array, " m"] | None = None,
 ) -> Match:
-    """`match`, every pass a subtraction of logarithms from the stored block."""
+    """`match`; every pass subtracts logarithms from the stored block."""
     padded = jnp.pad(masked(affinity.log(), source_mask, target_mask), ((0, 1), (0, 1)))
     for _ in range(passes):
         rows = nn.logsumexp(padded[:-1], axis=1, keepdims=True)

@@ -1,13 +1,13 @@
-"""The match and its gradient by products with the block, whoever has it: stored, or made on the go.
+"""The match and its gradient by products with a block that is stored in memory.
 
-Forward, a pass is u <- 1 / (m v + 1), v <- 1 / (m' u + 1). The gradient goes the same way backwards
-(`streamed` says how); in the end the gradient of log m_ij is m_ij times a product of two thin
-matrices, and the block spends it on the features.
+Forward, a pass is u <- 1 / (m v + 1), v <- 1 / (m' u + 1). The gradient takes the same steps
+backward (see `streamed`). In the end the gradient with respect to log m_ij is m_ij times a product
+of two thin matrices, and `Stored.spend` carries it on to the features.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -30,7 +30,10 @@ _HIGHEST = lax.Precision.HIGHEST
 
 
 class Spent(NamedTuple):
-    """Sums of share_ij over a block: times g_j, times f_i, times alpha - |f_i - g_j|^2, alone."""
+    """Sums of share_ij over a block.
+
+    In the order of the fields: times g_j, times f_i, times alpha - |f_i - g_j|^2, and as it is.
+    """
 
     source: Float[Array, "n d"]
     target: Float[Array, "m d"]
@@ -38,31 +41,15 @@ class Spent(NamedTuple):
     alpha: Float[Array, ""]
 
 
-@runtime_checkable
-class Block(Protocol):
-    """m_ij = exp(log affinity_ij - shift_i), zero where masked, for its products' sake."""
-
-    shift: Float[Array, " n"]
-    """max(0, the largest log affinity of the row), so that nothing overflows."""
-
-    def rows(self, right: Float[Array, "m c"]) -> Float[Array, "n c"]:
-        """m right."""
-
-    def columns(self, left: Float[Array, "n c"]) -> Float[Array, "m c"]:
-        """m' left."""
-
-    def spend(self, left: Float[Array, "n r"], right: Float[Array, "m r"]) -> Spent:
-        """The sums of share_ij = m_ij left_i . right_j."""
-
-
-def forward(block: Block, points: Float[Array, "m 3"], passes: int) -> tuple[Match, Trace]:
+def forward(block: Stored, points: Float[Array, "m 3"], passes: int) -> tuple[Match, Trace]:
     """The match, and what its gradient needs."""
     tiny = jnp.finfo(points.dtype).tiny
     slack = jnp.exp(-block.shift)
     v, every = jnp.ones(points.shape[0], points.dtype), []
-    for _ in range(passes):
-        # the floor is reached only where a whole row has vanished: it then stays without partner
-        u = 1 / jnp.maximum(block.rows(v[:, None])[:, 0] + slack, tiny)
+    for i in range(passes):
+        found = block.rows(v[:, None])[:, 0] if i else block.sums
+        # the floor is reached only if a whole row underflows: that point stays without a partner
+        u = 1 / jnp.maximum(found + slack, tiny)
         found = block.columns(u[:, None])[:, 0]
         every.append((u, v))
         v = 1 / (found + 1)
@@ -72,9 +59,9 @@ def forward(block: Block, points: Float[Array, "m 3"], passes: int) -> tuple[Mat
 
 
 def backward(
-    block: Block, affinity: Affinity, points: Float[Array, "m 3"], trace: Trace, gradient: Match
+    block: Stored, affinity: Affinity, points: Float[Array, "m 3"], trace: Trace, gradient: Match
 ) -> tuple[Affinity, Float[Array, "m 3"]]:
-    """The gradient of what was matched, and of the points."""
+    """The gradients with respect to the affinity and the points."""
     u, v_before, v, _, sums = trace
     of_sums = gradient_of_sums(gradient, sums)
     pull = of_sums * u[-1][:, None]
@@ -98,7 +85,10 @@ def backward(
 
 
 class Stored:
-    """The block as it is."""
+    """m_ij = exp(log affinity_ij - shift_i), zero where masked, and its products.
+
+    The shift of a row is max(0, its largest log affinity), so that nothing overflows.
+    """
 
     def __init__(
         self,
@@ -106,19 +96,27 @@ class Stored:
         masks: tuple[Bool[Array, " n"], Bool[Array, " m"]],
         shift: Float[Array, " n"] | None = None,
     ):
-        self.affinity = affinity
-        self.square = squared_distances(affinity.source, affinity.target)
+        self.affinity: Affinity = affinity
+        self.square: Array = squared_distances(affinity.source, affinity.target)
         log_values = masked(log_affinity(self.square, affinity.beta, affinity.alpha), *masks)
-        self.shift = jnp.maximum(jnp.max(log_values, axis=1), 0) if shift is None else shift
-        self.block = jnp.exp(log_values - self.shift[:, None])
+        self.shift: Array = jnp.maximum(jnp.max(log_values, axis=1), 0) if shift is None else shift
+        block = jnp.exp(log_values - self.shift[:, None])
+        sums = jnp.matmul(block, jnp.ones(block.shape[1], block.dtype), precision=_HIGHEST)
+        # the barrier is that of `dense`: XLA makes both in one kernel, and stores no logarithms
+        self.block: Array
+        self.sums: Array  # of the rows
+        self.block, self.sums = lax.optimization_barrier((block, sums))
 
     def rows(self, right: Float[Array, "m c"]) -> Float[Array, "n c"]:
+        """m right."""
         return jnp.matmul(self.block, right, precision=_HIGHEST)
 
     def columns(self, left: Float[Array, "n c"]) -> Float[Array, "m c"]:
+        """m' left."""
         return jnp.matmul(self.block.T, left, precision=_HIGHEST)
 
     def spend(self, left: Float[Array, "n r"], right: Float[Array, "m r"]) -> Spent:
+        """The sums of share_ij = m_ij left_i . right_j."""
         share = self.block * jnp.matmul(left, right.T, precision=_HIGHEST)
         return Spent(
             jnp.matmul(share, self.affinity.target, precision=_HIGHEST),

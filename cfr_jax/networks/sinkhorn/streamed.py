@@ -1,14 +1,16 @@
-"""The match without its block: rows are made from the features when they are needed, and dropped.
+"""The match without its block: rows are computed from the features when needed, then dropped.
 
-A pass needs all columns of a row to scale it, and all rows of a column to scale that. So blocks of
-whole rows go by: each is scaled and at once adds its share to the columns. One sweep over the block
-is one pass, and one more sums the targets. What is kept is u, v and a block of rows.
+To scale a row, a pass needs all of its columns; to scale a column, it needs all of its rows. So the
+match goes over blocks of whole rows: each block is scaled and adds its share to the columns at
+once. One sweep over the rows is one pass, and one more sweep sums the targets. Only u, v and one
+block of rows are in memory.
 
-The gradient goes the same way backwards. With a and b the gradients of the column and the row sums,
-pass p sends a = -v^2 dv to the rows, b = -u^2 (m a) to the columns of the pass before it, as
-dv = m' b. In the end the gradient of log m_ij is m_ij times a product of two thin matrices,
-sum_p (u_i a_j + b_i v_j) and the weighted targets, and is spent on the features in the same sweep.
-It takes as many sweeps as the forward direction; the last of them does three times the work.
+The gradient takes the same steps backward. Let a and b be the gradients of the column and the row
+sums. Pass p sends a = -v^2 dv to the rows, and b = -u^2 (m a) to the columns of the pass before it,
+where dv = m' b. In the end the gradient of log m_ij is m_ij times a product of two thin matrices,
+sum_p (u_i a_j + b_i v_j) plus the weighted targets. The last sweep computes it and carries it on to
+the features. There are as many sweeps as in the forward direction; the last one does three times
+the work.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from cfr_jax.networks.sinkhorn.affinity import (
     with_ones,
 )
 
-# For a large target a block has as many rows as make the product with its features worth reading.
+# For a large target: enough rows in a block to make one read of the target's features pay off.
 _LEAST_ROWS = 128
 _HIGHEST = lax.Precision.HIGHEST
 
@@ -40,7 +42,7 @@ _Shifted = tuple[_Rows, Array]
 
 
 def rows_of(m: int, entries: int) -> int:
-    """The rows of a block of so many entries."""
+    """The rows of a block with that many `entries` and m columns; at least 128."""
     return max(_LEAST_ROWS, entries // m)
 
 
@@ -52,7 +54,7 @@ def forward(
     passes: int,
     rows: int,
 ) -> tuple[Match, Trace]:
-    """The match, with memory for n + m rows and a block of at most `rows` rows, and its trace."""
+    """The match and its trace, in memory for n + m rows and a block of at most `rows` rows."""
     n, m = affinity.source.shape[0], affinity.target.shape[0]
     blocks = _Blocks(affinity, masks, rows)
     tiny = jnp.finfo(points.dtype).tiny
@@ -66,11 +68,10 @@ def forward(
             u = 1 / jnp.maximum(sums, tiny)
             return found + jnp.matmul(u, block, precision=_HIGHEST), (u, shift)
 
-        given: tuple = (blocks.rows,) if shift is None else (blocks.rows, shift)
-        found, (u, shift) = lax.scan(rows, jnp.zeros(m, v.dtype), given)
+        found, (u, shift) = lax.scan(rows, jnp.zeros(m, v.dtype), (blocks.rows, shift))
         return 1 / (found + 1), (u, v, found), shift
 
-    # The shift of a row is its largest entry, in every pass the same: the first one finds it.
+    # The shift of a row is its largest entry. It is the same in every pass; the first one finds it.
     v, first, shift = one_pass(jnp.ones(m, points.dtype))
     v, others = lax.scan(lambda v, _: one_pass(v, shift)[:2], v, None, length=passes - 1)
     u, v_before, found = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, others)
@@ -95,14 +96,14 @@ def backward(
     passes: int,
     rows: int,
 ) -> tuple[Affinity, Float[Array, "m 3"]]:
-    """The gradient of what was matched and of the points, in as little memory."""
+    """The gradients with respect to the affinity and the points, in as little memory."""
     n, m = affinity.source.shape[0], affinity.target.shape[0]
     blocks = _Blocks(affinity, masks, rows)
     u = jnp.stack([blocks.cut(one, 1) for one in trace.u])
     v_before, v, sums = trace.v_before, trace.v, trace.sums
     shifted = (blocks.rows, blocks.cut(trace.shift))
 
-    # from the match to the sums, to the last scaling of the rows
+    # from the match to its sums, then to the last scaling of the rows
     of_sums = gradient_of_sums(gradient, sums)
     pull = blocks.cut(of_sums) * u[-1][..., None]
     of_u = jnp.sum(blocks.cut(of_sums * sums), axis=-1) / u[-1]
@@ -175,7 +176,7 @@ def backward(
 
 
 class _Blocks:
-    """The block in pieces: rows of the source, cut and padded, made into affinities on demand."""
+    """The block in pieces: rows of the source, cut and padded; affinities are made on demand."""
 
     def __init__(self, affinity: Affinity, masks: tuple[Array, Array], most_rows: int) -> None:
         self.affinity, self.target_mask = affinity, masks[1]

@@ -1,7 +1,7 @@
-"""Where the pairs of a training are drawn, and so what it does in one go.
+"""Where training pairs are drawn, and so how many steps run at once.
 
-`HostDrawing`: workers draw batches ahead of their use, and each is a step. `DeviceDrawing`: the
-corpus lies on the device, and a program of several steps draws its own pairs.
+`HostDrawing`: threads draw batches ahead of time, and each batch is one step. `DeviceDrawing`: the
+corpus is on the device, and a program of several steps draws its own pairs.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from cfr_jax.training.step import Recipe, TrainState
 
 
 class Stretch(NamedTuple):
-    """Some steps in one go; `run` donates the state that it is given."""
+    """Some steps that run at once; `run` donates the state that it is given."""
 
     steps: int
     run: Callable[[TrainState], tuple[TrainState, PairLoss]]
 
 
 class Leg(NamedTuple):
-    """A phase, and what its steps are compiled for."""
+    """A phase, and what its steps depend on when they are compiled."""
 
     phase: Phase
     sampling: Sampling
@@ -35,21 +35,23 @@ class Leg(NamedTuple):
 
 @runtime_checkable
 class Drawing(Protocol):
-    """What the loop asks of a place where pairs are drawn."""
+    """A way to draw pairs, as the training loop uses it."""
 
     def begin(self, leg: Leg, state: TrainState) -> None:
-        """Compiles in the background what can be, as soon as it is known that `leg` is next."""
+        """Starts to compile in the background, as soon as it is known that `leg` is next."""
         ...
 
     def stretches(self, leg: Leg, state: TrainState, ran: int, position: int) -> Iterator[Stretch]:
-        """The steps of a leg of which `ran` are done, from that position in the stream on. (Of
-        `state` only the sizes are of interest.)"""
+        """Yields the remaining steps of a leg, of which `ran` are done.
+
+        `position` is the next pair in the stream. Only the shapes of `state` matter.
+        """
         ...
 
 
 def make_drawing(config: TrainingConfig, mixture: Mixture, mesh: Mesh) -> Drawing:
-    """What `config.train.draw` asks for, "host" or "device"."""
-    # imported here: each knows this file
+    """The drawing that `config.train.draw` names, "host" or "device"."""
+    # imported here because both modules import this one
     if config.train.draw == "device":
         from cfr_jax.training.drawing.device import DeviceDrawing
 

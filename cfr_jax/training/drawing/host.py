@@ -1,4 +1,4 @@
-"""Batches drawn by the host's cores, each of them a step."""
+"""Draws batches on the host's cores; each batch is one step."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from cfr_jax.training.step import TrainState
 
 
 class HostDrawing:
-    """`config.train.workers` draw ahead, from sources of any kind."""
+    """`config.train.workers` threads draw ahead, from sources of any kind."""
 
     def __init__(self, config: TrainingConfig, mixture: Mixture, mesh: Mesh):
         self._config, self._mixture, self._mesh = config, mixture, mesh
 
     def begin(self, leg: Leg, state: TrainState) -> None:
-        """Nothing: the first step compiles."""
+        """Does nothing: the first step compiles."""
 
     def stretches(self, leg: Leg, state: TrainState, ran: int, position: int) -> Iterator[Stretch]:
-        """One for each batch."""
+        """Yields one step per batch."""
         stream = batches(
             self._mixture,
             leg.sampling,

@@ -1,1 +1,1 @@
-"""What a training tells of itself: metrics, charts, a page."""
+"""The reports of a training: metrics, charts, and a page."""

@@ -1,7 +1,7 @@
-"""The same measurements for TensorBoard, with histograms and pictures, where it is installed.
+"""The same measurements for TensorBoard, with histograms and pictures, if it is installed.
 
-The records are tensorboardX's, but not its usual writer, which works in a thread: where a disk is
-full, that dies unheard, and the training waits for it for ever.
+This uses the records of tensorboardX but not its usual writer. That one works in a thread: if the
+disk is full, the thread dies silently and the training waits for it forever.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from cfr_jax.viewer.picture import write_picture
 from cfr_jax.viewer.scene import Scene
 
 _BINS = 30  # of a histogram
-MISSING = 'no TensorBoard files: pip install "cfr_jax[train]" to have them'
-NO_PICTURES = 'no pictures among the TensorBoard files: pip install "cfr_jax[viz]" to have them'
+MISSING = 'no TensorBoard files: to get them, pip install "cfr_jax[train]"'
+NO_PICTURES = 'no pictures in the TensorBoard files: to get them, pip install "cfr_jax[viz]"'
 
 
 class Board:
-    """Event files in `folder`. Without tensorboardX there are none, without matplotlib no pictures
-    in them; `missing` says so.
+    """Event files in `folder`.
 
-    Every method raises OSError, naming the folder, where it cannot be written.
+    Without tensorboardX there are none, and without matplotlib they have no pictures; `missing`
+    then says so. Every method raises an OSError that names the folder if it cannot be written.
     """
 
     def __init__(self, folder: Path, step: int):
@@ -50,11 +50,11 @@ class Board:
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             self._events = EventsWriter(str(folder / "events"))
-            # what an interrupted run wrote after its last checkpoint is hidden
+            # this hides what an interrupted run wrote after its last checkpoint
             self._add(step + 1, session_log=SessionLog(status=SessionLog.START))
 
-    def training(self, line: dict, measured: list[PairLoss]) -> None:
-        """The line of the journal, and how alpha and beta are spread over the pairs."""
+    def training(self, line: dict[str, Any], measured: list[PairLoss]) -> None:
+        """Writes a line of the journal, and the distributions of alpha and beta over the pairs."""
         if self._events is None:
             return
         step = line["step"]
@@ -68,8 +68,10 @@ class Board:
                         self._add(step, summary=drawn)
             self._events.flush()
 
-    def validation(self, step: int, found: dict, pictures: list[tuple[str, Scene]]) -> None:
-        """Errors, and pairs as the network laid them."""
+    def validation(
+        self, step: int, found: dict[str, Any], pictures: list[tuple[str, Scene]]
+    ) -> None:
+        """Writes the errors, and pictures of pairs as the network registered them."""
         if self._events is None:
             return
         drawn = [
@@ -84,7 +86,7 @@ class Board:
             self._events.flush()
 
     def close(self) -> None:
-        """Ends the file."""
+        """Closes the file."""
         if self._events is not None:
             with writing(self._folder):
                 self._events.close()

@@ -1,9 +1,10 @@
-"""What is drawn of a training: the page and TensorBoard both draw the numbers named here."""
+"""The charts of a training: the page and TensorBoard both draw the numbers named here."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 _TRAINING = ("loss", "pose", "correspondence", "learning_rate", "steps_per_second", "skipped")
 _ITERATIONS = ("rotation_error", "translation_error", "beta", "alpha")
@@ -12,7 +13,7 @@ _VALIDATION = ("rotation_mean", "rotation_median", "translation_mean", "recall_5
 
 @dataclass(frozen=True)
 class Curve:
-    """How one number went over the steps."""
+    """One number over the steps."""
 
     name: str
     steps: Sequence[int]
@@ -21,17 +22,17 @@ class Curve:
 
 @dataclass(frozen=True)
 class Chart:
-    """Curves of one unit that belong together."""
+    """Curves that belong together, in one unit."""
 
     title: str
     unit: str
     curves: Sequence[Curve]
 
 
-def scalars(line: dict) -> dict[str, float]:
-    """The numbers of a line of the journal by tag, as in "training/loss".
+def scalars(line: dict[str, Any]) -> dict[str, float]:
+    """The numbers in a line of the journal by tag, such as "training/loss".
 
-    What is known of every iteration has a number behind, from 1: "training/beta/1".
+    Values per iteration are numbered from 1: "training/beta/1".
     """
     validation = line.get("validation", {})
     found = {f"training/{name}": line[name] for name in _TRAINING if name in line}
@@ -41,8 +42,8 @@ def scalars(line: dict) -> dict[str, float]:
     return found | _numbered("validation/rotation", validation.get("rotation_by_iteration", ()))
 
 
-def charts(lines: Sequence[dict]) -> list[Chart]:
-    """The charts of a whole journal; those of which nothing was measured are left out."""
+def charts(lines: Sequence[dict[str, Any]]) -> list[Chart]:
+    """The charts of a whole journal; charts without any measurement are left out."""
     measured = [(line["step"], scalars(line)) for line in lines]
     tags = {tag for _, found in measured for tag in found}
     count = sum(tag.startswith("training/beta/") for tag in tags)

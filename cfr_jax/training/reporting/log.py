@@ -1,4 +1,4 @@
-"""What a training says of itself: a progress bar for people, `metrics.jsonl` for programs."""
+"""The running reports of a training: a progress bar for people, `metrics.jsonl` for programs."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from cfr_jax.training.losses import PairLoss
 
 
 class Clock:
-    """Seconds of training, of the wall and of the processors; stopped during validations.
+    """Wall-clock and processor seconds of a training; it is stopped during validations.
 
-    Goes on from what a run had used before, so that it counts all of a training. Processor seconds
-    are those of all threads of this process.
+    It starts from the seconds that earlier runs have used, so that it counts the whole training.
+    Processor seconds are those of all threads of this process.
     """
 
     def __init__(self, seconds: float = 0.0, processor_seconds: float = 0.0):
@@ -29,12 +29,12 @@ class Clock:
         self._since: np.ndarray | None = None
 
     def start(self) -> None:
-        """Goes on counting."""
+        """Starts or resumes counting."""
         if self._since is None:
             self._since = self._now()
 
     def stop(self) -> None:
-        """Counts no more."""
+        """Stops counting."""
         self._used, self._since = self._total(), None
 
     def read(self) -> dict[str, float]:
@@ -52,7 +52,7 @@ class Clock:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Within, an OSError says what could not be written and what to do."""
+    """Inside this context, an OSError says what could not be written and what to do."""
     try:
         yield
     except OSError as error:
@@ -63,23 +63,23 @@ def writing(path: Path) -> Iterator[None]:
 
 
 class MetricsLog:
-    """`metrics.jsonl`: an object a line, appended; read again when a run goes on."""
+    """`metrics.jsonl`: one appended object per line; a run that resumes continues the file."""
 
     def __init__(self, path: Path, step: int):
         self.path = path
-        # what an interrupted run measured after its last checkpoint will be measured again, and
-        # all of it where there is none
+        # what an interrupted run measured after its last checkpoint will be measured again; without
+        # a checkpoint, that is everything
         lines = [line for line in read_journal(path) if step and line["step"] <= step]
         write_atomically(path, "".join(json.dumps(line) + "\n" for line in lines).encode())
 
-    def write(self, line: dict) -> None:
-        """Appends one line. Raises OSError, naming the file, where that cannot be written."""
+    def write(self, line: dict[str, Any]) -> None:
+        """Appends one line. Raises an OSError that names the file if it cannot be written."""
         with writing(self.path), self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, allow_nan=False) + "\n")
 
 
-def read_journal(path: Path) -> list[dict]:
-    """The lines of a `metrics.jsonl`; one that a crash left unfinished is passed over."""
+def read_journal(path: Path) -> list[dict[str, Any]]:
+    """The lines of a `metrics.jsonl`; skips a line that a crash left unfinished."""
     lines = []
     for text in path.read_text("utf-8").splitlines() if path.exists() else ():
         try:
@@ -90,9 +90,9 @@ def read_journal(path: Path) -> list[dict]:
 
 
 def summarize(measured: list[PairLoss]) -> dict[str, Any]:
-    """Means over the pairs of several steps; alpha and beta per iteration.
+    """Means over the pairs of several steps; errors, alpha and beta per iteration.
 
-    A pair of which anything is not finite is left out; where that leaves none, nothing is said.
+    Pairs with any value that is not finite are left out; if none remain, the result is empty.
     """
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *measured)
     rows = [leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(joined)]
@@ -112,26 +112,26 @@ def summarize(measured: list[PairLoss]) -> dict[str, Any]:
 
 
 class Bar:
-    """Loss, errors, steps per second and the time left, on standard error."""
+    """A progress bar with loss, errors, steps per second and remaining time, on standard error."""
 
     def __init__(self, total: int, step: int, shown: bool):
         options = {"total": total, "initial": step, "disable": not shown, "mininterval": 5}
         self._bar = Progress(desc="training", unit=" steps", **options)
 
     def plan(self, total: int) -> None:
-        """There will be so many steps."""
+        """Sets the total number of steps."""
         self._bar.total = total
         self._bar.refresh()
 
     def step(self, step: int) -> None:
-        """Steps done so far."""
+        """Sets the number of steps done so far."""
         self._bar.update(step - self._bar.n)
 
     def forget_time(self) -> None:
-        """What went by since the last step is not counted: it says nothing of those to come."""
+        """Ignores the time since the last step, which does not predict the coming steps."""
         self._bar.unpause()
 
-    def measured(self, line: dict) -> None:
+    def measured(self, line: dict[str, Any]) -> None:
         """Shows the newest means, if any: rotation error in degrees, translation error in radii."""
         if "loss" not in line:
             return
@@ -143,10 +143,10 @@ class Bar:
         )
 
     def say(self, text: str) -> None:
-        """A line above the bar."""
+        """Prints a line above the bar."""
         if not self._bar.disable:
             self._bar.write(text)
 
     def close(self) -> None:
-        """Ends the bar."""
+        """Closes the bar."""
         self._bar.close()

@@ -1,10 +1,11 @@
-"""Everything that a training reports, in one hand: only the first of several processes speaks."""
+"""All reports of a training in one place; of several processes, only the first one reports."""
 
 from __future__ import annotations
 
 import contextlib
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -25,14 +26,14 @@ _PICTURES = 3  # validation pairs drawn for TensorBoard
 
 
 class Reporter:
-    """Bar, journal, TensorBoard and the page at the end.
+    """The progress bar, the journal, TensorBoard, and the page at the end.
 
-    Measurements stay on the device until they are written. `clock` stands still between `pause`
-    and `resume`.
+    Measurements stay on the device until they are written. `clock` stops between `pause` and
+    `resume`.
     """
 
-    def __init__(self, workdir: Path, task: Task, about: dict):
-        self.clock = Clock(**about["clock"])
+    def __init__(self, workdir: Path, task: Task, about: dict[str, Any]):
+        self.clock: Clock = Clock(**about["clock"])
         self._workdir, self._task, self._about = workdir, task, about
         # what was measured and not yet written, perhaps before an interruption
         before = about["pending"]
@@ -52,10 +53,10 @@ class Reporter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Ends the bar, and writes the page unless something is wrong."""
+        """Closes the bar, and writes the page unless there was an error."""
         self._bar.close()
         if self._journal is not None and self._board is not None:
-            # on a full disk, of two errors the first says what to do
+            # on a full disk there may be a second error, but the first one says what to do
             with contextlib.nullcontext() if kind is None else contextlib.suppress(OSError):
                 self._board.close()
             if kind is None or issubclass(kind, Stopped):
@@ -63,11 +64,11 @@ class Reporter:
                 write_summary(self._workdir / "summary.html", lines, self._about)
 
     def say(self, text: str) -> None:
-        """A line above the bar."""
+        """Prints a line above the bar."""
         self._bar.say(text)
 
     def begin(self, phase: Phase) -> None:
-        """Counts time from here on; the first step of a phase is compiled first."""
+        """Announces a phase and counts time from here on; its first step has to compile."""
         self._bar.say(
             f"{phase.steps} steps of {phase.batch} pairs, {phase.points} points, "
             f"{phase.neighbors} neighbors: compiling, up to a minute"
@@ -81,19 +82,21 @@ class Reporter:
         self.clock.start()
 
     def pause(self) -> None:
-        """Counts no time until `resume`."""
+        """Stops counting time until `resume`."""
         if self._waiting:
             jax.block_until_ready(self._waiting[-1].total)
         self.clock.stop()
 
     def plan(self, task: Task) -> None:
-        """Says how many steps there will be, where that was not known before."""
+        """Sets the number of steps, if it was not known before."""
         self._task = task
         self._bar.plan(task.steps)
 
     def step(self, done: int, measured: PairLoss, steps: int = 1) -> None:
-        """Takes note of some steps, and waits for those before: the device has always some to do,
-        and never many."""
+        """Notes some new steps, and waits for the ones before them.
+
+        So the device always has some steps queued, but never many.
+        """
         if self._waiting:
             jax.block_until_ready(self._waiting[-1].total)
         self._waiting.append(measured)
@@ -109,10 +112,10 @@ class Reporter:
         line = {
             "step": done,
             **summarize(self._waiting),
-            # the optimizer has not seen the steps that were left out
+            # the optimizer has not counted the skipped steps
             "learning_rate": float(self._task.schedule(np.int32(max(0, done - 1 - skipped)))),
             "steps_per_second": self._steps / max(used["seconds"] - self._written, 1e-9),
-            # all of a training, over its restarts, without validations
+            # of the whole training, including earlier runs, without validations
             "training_seconds": used["seconds"],
             "processor_seconds": used["processor_seconds"],
             "skipped": skipped,
@@ -124,7 +127,7 @@ class Reporter:
         self._waiting, self._steps, self._written = [], 0, used["seconds"]
         self._bar.measured(line)
 
-    def pending(self) -> dict:
+    def pending(self) -> dict[str, Any]:
         """What a checkpoint has to know, so that a run that goes on writes the same lines."""
         if not self._waiting:
             return {}
@@ -134,7 +137,7 @@ class Reporter:
             "written": self._written,
         }
 
-    def validated(self, done: int, found: dict) -> None:
+    def validated(self, done: int, found: dict[str, Any]) -> None:
         """Writes a validation; `found["transforms"]` (b, L, 4, 4) is for the pictures."""
         shown = {name: value for name, value in found.items() if name != "transforms"}
         if self._journal is not None and self._board is not None:

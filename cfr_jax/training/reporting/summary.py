@@ -1,4 +1,4 @@
-"""`summary.html`: what a training did, on one page that needs nothing else."""
+"""`summary.html`: the results of a training, on one self-contained page."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.training.reporting.charts import Chart, charts
@@ -23,9 +24,9 @@ pre { background: #fafbfc; border: 1px solid #e3e6ea; padding: .6rem; overflow-x
 """
 
 
-def write_summary(path: Path, lines: Sequence[dict], about: dict) -> None:
-    """The curves of a journal's `lines`, the best validation, the time used and the config of
-    `about` (what a checkpoint says of itself)."""
+def write_summary(path: Path, lines: Sequence[dict[str, Any]], about: dict[str, Any]) -> None:
+    """Writes a page with the curves of a journal's `lines`, and the best validation, the time and
+    the config in `about` (what a checkpoint says about itself)."""
     body = "".join(_figure(chart) for chart in charts(lines))
     best = about["best"]
     rows = {

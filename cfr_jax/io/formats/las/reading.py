@@ -1,7 +1,7 @@
 """LAS and LAZ: coordinates are 32-bit integers with a scale and an offset.
 
-LAS is parsed here: the header has to be checked against the file anyway (laspy spends seconds on
-a flipped count of records), and behind it the coordinates stand in plain rows. LAZ is unpacked by
+LAS is read here: the header has to be checked against the file anyway (laspy spends seconds on a
+flipped count of records), and the coordinates stand in plain rows behind it. LAZ is unpacked by
 `lazrs`, the decoder that laspy uses.
 """
 
@@ -12,20 +12,27 @@ import struct
 from types import ModuleType
 
 import numpy as np
-from jaxtyping import Float64, Int32
+from jaxtyping import Float64, Int32, UInt8
 
 from cfr_jax.io.cloud import CloudFileError, PointCloud
-from cfr_jax.io.formats.laz import check_chunks
+from cfr_jax.io.formats.las.chunks import check_chunks
+from cfr_jax.io.formats.las.fields import properties
+from cfr_jax.io.table import cloud_of_filled, table_of
 
 # Bytes of a point in the formats 0 to 10; a file's rows may be longer, by fields of its own.
 _ROW_SIZES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
 _RECORD_HEADER = 54
 _LASZIP = (b"laszip encoded", 22204)
+_EXTRA_BYTES = (b"LASF_Spec", 4)
 _ROWS_AT_ONCE = 1 << 16
 
 
-def parse(data: bytes, name: str) -> PointCloud:
+def parse(
+    data: bytes, name: str, *, columns: tuple[str, ...] | None = None, whole: bool = False
+) -> PointCloud:
     """x, y, z in the file's unit, scaled and offset as its header says."""
+    if columns is not None:
+        raise CloudFileError("columns: LAS files say themselves what they hold")
     if data[:4] != b"LASF":
         raise CloudFileError(f"byte 0: starts with {data[:4]!r}, wanted b'LASF'")
     major, minor = data[24:26] if len(data) >= 26 else (0, 0)
@@ -52,9 +59,12 @@ def parse(data: bytes, name: str) -> PointCloud:
     if count == 0:
         raise CloudFileError("holds no points, wanted at least one")
 
+    rows: UInt8[np.ndarray, "n size"] | None = None
     if kind & 0xC0:
-        record = _laszip_record(data, header_size, start, records)
-        integers = _unpack(data, start, count, row_size, record)
+        record = _record(data, header_size, start, records, _LASZIP)
+        if record is None:
+            raise CloudFileError("wanted a 'laszip encoded' record, found none")
+        integers, rows = _unpack(data, start, count, row_size, record, whole)
     else:
         if start + count * row_size > len(data):
             raise CloudFileError(
@@ -62,7 +72,14 @@ def parse(data: bytes, name: str) -> PointCloud:
                 f"the file holds {len(data) - start}"
             )
         integers = np.ndarray((count, 3), "<i4", data, start, (row_size, 4))
-    return PointCloud(_scaled(integers, scale, offset), None, name)
+        rows = np.ndarray((count, row_size), np.uint8, data, start)
+    points = _scaled(integers, scale, offset)
+    if not whole or rows is None:
+        return cloud_of_filled(points, None, name)
+    described = _record(data, header_size, start, records, _EXTRA_BYTES) or b""
+    names, values = properties(rows, layout, described)
+    table = table_of(["x", "y", "z", *names], [*points.T, *values], source="LAS")
+    return cloud_of_filled(points, None, name, (), table)
 
 
 def _scaled(
@@ -76,25 +93,29 @@ def _scaled(
     return points
 
 
-def _laszip_record(data: bytes, position: int, end: int, records: int) -> bytes:
-    """The record among those before the points that tells how they are compressed."""
+def _record(
+    data: bytes, position: int, end: int, records: int, wanted: tuple[bytes, int]
+) -> bytes | None:
+    """The record of this user and number among those before the points, if there is one."""
     for _ in range(min(records, (end - position) // _RECORD_HEADER)):
         if position + _RECORD_HEADER > end:
             break
         user, number, size = struct.unpack_from("<2x16sHH", data, position)
         body = position + _RECORD_HEADER
         position = body + size
-        if (user.rstrip(b"\0"), number) == _LASZIP and position <= end:
+        if (user.rstrip(b"\0"), number) == wanted and position <= end:
             return data[body:position]
-    raise CloudFileError(f"byte {position}: wanted a 'laszip encoded' record, found none")
+    return None
 
 
 def _unpack(
-    data: bytes, start: int, count: int, row_size: int, record: bytes
-) -> Int32[np.ndarray, "n 3"]:
+    data: bytes, start: int, count: int, row_size: int, record: bytes, whole: bool
+) -> tuple[Int32[np.ndarray, "n 3"], UInt8[np.ndarray, "n size"] | None]:
+    """The coordinates, and all bytes of the points if they are wanted as a whole."""
     lazrs = _import_lazrs()
     check_chunks(data, start, count, row_size, record)
     integers = np.empty((count, 3), np.int32)
+    held = np.empty((count, row_size), np.uint8) if whole else None
     rows = np.empty((min(count, _ROWS_AT_ONCE), row_size), np.uint8)
     done = 0
     try:
@@ -105,6 +126,8 @@ def _unpack(
             part = rows[: count - done]
             unpacker.decompress_many(part.reshape(-1))
             integers[done : done + len(part)] = part[:, :12].copy().view("<i4")
+            if held is not None:
+                held[done : done + len(part)] = part
             done += len(part)
     except (KeyboardInterrupt, SystemExit):
         raise
@@ -112,7 +135,7 @@ def _unpack(
         raise CloudFileError(
             f"byte {start}: cannot unpack points {done} and following of {count}: {error}"
         ) from None
-    return integers
+    return integers, held
 
 
 def _import_lazrs() -> ModuleType:

@@ -1,4 +1,4 @@
-"""Numbers written as text, by numpy's own parser; mistakes are told by their line."""
+"""Rows of numbers in text, read by numpy's parser; a mistake is told by its line."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Lines:
         try:
             return _load(self.data, delimiter, columns)
         except ValueError as error:
-            where = self.first + _bad_line(self.data, delimiter, columns)
+            where = self.first + bad_line(self.data, delimiter, columns)
             raise CloudFileError(f"line {where}: {error}") from None
 
     def rows(self) -> tuple[Float64[np.ndarray, " k"], Int64[np.ndarray, " r"]]:
@@ -78,7 +78,7 @@ class Lines:
         try:
             values = _load(self.data.translate(_BLANKS_TO_NEWLINES), None, None).ravel()
         except ValueError as error:
-            where = self.first + _bad_line(self.data, None, (0,))
+            where = self.first + bad_line(self.data, None, (0,))
             raise CloudFileError(f"line {where}: {error}") from None
         filled = np.frombuffer(self.data, np.uint8) > 32
         filled[1:] &= ~filled[:-1]  # only the first byte of each number is left
@@ -98,7 +98,7 @@ def _load(
     )
 
 
-def _bad_line(data: bytes, delimiter: str | None, columns: tuple[int, ...] | None) -> int:
+def bad_line(data: bytes, delimiter: str | None, columns: tuple[int, ...] | None) -> int:
     """Index of the line numpy stumbled over; numpy itself counts without the blank ones."""
     separator = None if delimiter is None else delimiter.encode()
     width = None

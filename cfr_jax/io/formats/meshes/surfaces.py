@@ -1,4 +1,4 @@
-"""OFF, OBJ and STL: meshes of vertices and faces, in text or (STL) in fixed rows."""
+"""OFF and OBJ: meshes of vertices and faces, in text."""
 
 from __future__ import annotations
 
@@ -6,23 +6,17 @@ import re
 
 import numpy as np
 
-from cfr_jax.io.cloud import CloudFileError
-from cfr_jax.io.formats.ascii import Lines, clean_text
+from cfr_jax.io.cloud import CloudFileError, PointCloud
+from cfr_jax.io.formats.text.lines import Lines, clean_text
 from cfr_jax.io.mesh import Mesh, fan_triangles
+from cfr_jax.io.table import cloud_of_filled
 
 _COMMENT = re.compile(rb"#[^\n]*")
 _OFF_MARK = re.compile(rb"\s*(?:ST)?(?:C)?(?:N)?OFF")
 
+_NO_FACES = "has no faces: took its vertices for a cloud"
 _INDENT = re.compile(rb"^[ \t]+", re.MULTILINE)
 _TEXTURE_AND_NORMAL = re.compile(rb"/\S*")
-
-_STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_STL_FACET = re.compile(
-    rb"\s*facet\s+normal\s+\S+\s+\S+\s+\S+\s+outer\s+loop"
-    + rb"\s+vertex\s+(\S+\s+\S+\s+\S+)" * 3
-    + rb"\s+endloop\s+endfacet(?=\s)",
-    re.IGNORECASE,
-)
 
 
 def parse_off(data: bytes, name: str) -> Mesh:
@@ -57,8 +51,11 @@ def parse_off(data: bytes, name: str) -> Mesh:
     return Mesh(table[:, :3], triangles, name)
 
 
-def parse_obj(data: bytes, name: str) -> Mesh:
-    """The lines `v` and `f` of an OBJ; everything else (materials, groups, ...) is left out."""
+def parse_obj(data: bytes, name: str) -> Mesh | PointCloud:
+    """The lines `v` and `f` of an OBJ; everything else (materials, groups, ...) is left out.
+
+    A file without a line `f` is a cloud of its vertices, and a note says so.
+    """
     text = _INDENT.sub(b"", clean_text(data).replace(b"\\\n", b"  "))
     vertices, faces = _tagged(text, b"v"), _tagged(text, b"f")
     if len(vertices) == 0:
@@ -67,6 +64,8 @@ def parse_obj(data: bytes, name: str) -> Mesh:
     values, starts = vertices.rows()
     _check_lines(vertices, starts, values, at_least=3)
     points = values[starts[:, None] + np.arange(3)]
+    if len(faces) == 0:
+        return cloud_of_filled(points, None, name, (_NO_FACES,))
 
     corners, starts = Lines(_TEXTURE_AND_NORMAL.sub(b"", faces.data)).rows()
     _check_lines(faces, starts, corners, at_least=1)
@@ -98,38 +97,3 @@ def _check_lines(lines: Lines, starts: np.ndarray, values: np.ndarray, at_least:
     if short.any():
         where = lines.data.count(b"\n", 0, int(lines.starts[int(np.argmax(short))])) + 1
         raise CloudFileError(f"line {where}: wanted {at_least} numbers at least")
-
-
-def parse_stl(data: bytes, name: str) -> Mesh:
-    """Binary STL, recognized by its size, or the text form; corners are not merged."""
-    if len(data) >= 84:
-        count = int.from_bytes(data[80:84], "little")
-        if 84 + count * _STL_ROW.itemsize == len(data):
-            rows = np.frombuffer(data, _STL_ROW, count, 84)
-            return _soup(rows["corners"].reshape(-1, 3), name)
-        if data[:5].lower() != b"solid":
-            raise CloudFileError(
-                f"byte 80: {count} triangles are {84 + count * _STL_ROW.itemsize} bytes, "
-                f"the file has {len(data)}"
-            )
-    return _parse_stl_text(clean_text(data), name)
-
-
-def _parse_stl_text(text: bytes, name: str) -> Mesh:
-    if text[:5].lower() != b"solid":
-        raise CloudFileError(f"byte 0: starts with {text[:8]!r}, wanted 'solid' or a binary STL")
-    position = text.find(b"\n")
-    corners: list[bytes] = []
-    while position >= 0 and (facet := _STL_FACET.match(text, position)):
-        corners += facet.groups()
-        position = facet.end()
-    if position < 0 or not text[position:].lstrip()[:8].lower() == b"endsolid":
-        line = text.count(b"\n", 0, max(position, 0)) + 1
-        raise CloudFileError(f"behind line {line}: wanted a whole facet, or 'endsolid'")
-    joined = b"\n".join(corner.replace(b"\n", b" ") for corner in corners)
-    return _soup(Lines(joined).table().reshape(-1, 3), name)
-
-
-def _soup(corners: np.ndarray, name: str) -> Mesh:
-    """Triangles that share no vertices."""
-    return Mesh(corners, np.arange(len(corners)).reshape(-1, 3), name)

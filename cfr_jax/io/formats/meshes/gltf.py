@@ -6,21 +6,22 @@ import base64
 import json
 import struct
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from cfr_jax.io.cloud import CloudFileError, as_float64
+from cfr_jax.io.cloud import CloudFileError, PointCloud, as_float64
 from cfr_jax.io.files import contents
+from cfr_jax.io.formats.meshes.nodes import get, placement
 from cfr_jax.io.mesh import Mesh
-
-T = TypeVar("T")
+from cfr_jax.io.table import cloud_of_filled
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}
-_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
+_SURFACES = (_TRIANGLES, _STRIP, _FAN)
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 # A mesh may be placed many times; this bounds the rows that a small file can unfold to.
 _ALWAYS_ALLOWED_ROWS = 1 << 19
@@ -28,8 +29,11 @@ _MOST_ROWS_PER_BYTE = 1
 _ROWS_PER_PRIMITIVE = 64  # what even an empty one takes, in time
 
 
-def parse_glb(data: bytes, name: str, folder: Path) -> Mesh:
-    """The triangles of the scene, each mesh placed as its nodes say; meters, y up, as in glTF."""
+def parse_glb(data: bytes, name: str, folder: Path) -> Mesh | PointCloud:
+    """The triangles of the scene, each mesh placed as its nodes say; meters, y up, as in glTF.
+
+    A scene that has points and no triangles is a cloud.
+    """
     if data[:4] != b"glTF" or len(data) < 20:
         raise CloudFileError(f"byte 0: starts with {data[:4]!r}, wanted b'glTF' and a header")
     version, length = struct.unpack_from("<II", data, 4)
@@ -50,12 +54,12 @@ def parse_glb(data: bytes, name: str, folder: Path) -> Mesh:
         position += size
     if _JSON_CHUNK not in chunks:
         raise CloudFileError("byte 12: wanted a chunk of JSON, found none")
-    return _Scene(chunks[_JSON_CHUNK], chunks.get(_BINARY_CHUNK), folder).mesh(name)
+    return _Scene(chunks[_JSON_CHUNK], chunks.get(_BINARY_CHUNK), folder).shape(name)
 
 
-def parse_gltf(data: bytes, name: str, folder: Path) -> Mesh:
+def parse_gltf(data: bytes, name: str, folder: Path) -> Mesh | PointCloud:
     """As `parse_glb`; buffers are read from the file's own folder only."""
-    return _Scene(data, None, folder).mesh(name)
+    return _Scene(data, None, folder).shape(name)
 
 
 class _Scene:
@@ -71,37 +75,45 @@ class _Scene:
         self.folder = folder
         self.buffers: dict[int, bytes] = {} if binary is None else {0: binary}
         self.room = _ALWAYS_ALLOWED_ROWS + _MOST_ROWS_PER_BYTE * (len(text) + len(binary or b""))
-        needed = _get(self.document, "extensionsRequired", list, [])
+        needed = get(self.document, "extensionsRequired", list, [])
         packed = [name for name in needed if "compression" in str(name)]
         if packed:
             raise CloudFileError(f"needs the extension {packed[0]!r}, wanted an uncompressed mesh")
 
-    def mesh(self, name: str) -> Mesh:
-        """All triangles, in the frame of the scene."""
+    def shape(self, name: str) -> Mesh | PointCloud:
+        """All triangles, or the points of a scene without any, in the frame of the scene."""
+        mesh = self._gathered(name, _SURFACES)
+        if len(mesh.triangles) == 0:
+            points = self._gathered(name, (_POINTS,)).vertices
+            if len(points):
+                return cloud_of_filled(np.asarray(points), None, name)
+        return mesh
+
+    def _gathered(self, name: str, modes: tuple[int, ...]) -> Mesh:
         vertices: list[np.ndarray] = [np.empty((0, 3))]
         triangles: list[np.ndarray] = [np.empty((0, 3), np.int64)]
         count = 0
-        for index, placement in self._placed_meshes():
-            for primitive in _get(self._item("meshes", index), "primitives", list):
-                points, faces = self._primitive(primitive)
+        for index, placed in self._placed_meshes():
+            for primitive in get(self._item("meshes", index), "primitives", list):
+                points, faces = self._primitive(primitive, modes)
                 self.room -= len(points) + len(faces) + _ROWS_PER_PRIMITIVE
                 if self.room < 0:
                     raise CloudFileError("unfolds, by meshes placed again, to more than we read")
                 with np.errstate(all="ignore"):  # what is not finite is refused later on
-                    vertices.append(points @ placement[:3, :3].T + placement[:3, 3])
+                    vertices.append(points @ placed[:3, :3].T + placed[:3, 3])
                 triangles.append(faces + count)
                 count += len(points)
         return Mesh(np.concatenate(vertices), np.concatenate(triangles), name)
 
     def _placed_meshes(self) -> list[tuple[int, Float64[np.ndarray, "4 4"]]]:
         """Each mesh of the scene with the transform of its frame into the scene's."""
-        nodes = _get(self.document, "nodes", list, [])
-        scenes = _get(self.document, "scenes", list, [])
+        nodes = get(self.document, "nodes", list, [])
+        scenes = get(self.document, "scenes", list, [])
         if scenes:
-            scene = self._item("scenes", _get(self.document, "scene", int, 0))
-            roots = _get(scene, "nodes", list, [])
+            scene = self._item("scenes", get(self.document, "scene", int, 0))
+            roots = get(scene, "nodes", list, [])
         else:
-            children = (c for node in nodes for c in _get(node, "children", list, []))
+            children = (c for node in nodes for c in get(node, "children", list, []))
             below = {child for child in children if type(child) is int}
             roots = [index for index in range(len(nodes)) if index not in below]
         placed = []
@@ -114,21 +126,23 @@ class _Scene:
                 raise CloudFileError(f"node {index} hangs below two nodes, wanted a tree")
             visited.add(index)
             with np.errstate(all="ignore"):
-                placement = above @ _placement(node)
+                placed_at = above @ placement(node)
             if "mesh" in node:
-                placed.append((_get(node, "mesh", int), placement))
-            todo += [(child, placement) for child in reversed(_get(node, "children", list, []))]
+                placed.append((get(node, "mesh", int), placed_at))
+            todo += [(child, placed_at) for child in reversed(get(node, "children", list, []))]
         return placed
 
-    def _primitive(self, primitive: Any) -> tuple[np.ndarray, Int64[np.ndarray, "t 3"]]:
-        mode = _get(primitive, "mode", int, _TRIANGLES)
-        if mode not in (_TRIANGLES, _STRIP, _FAN):  # points and lines have no surface
+    def _primitive(
+        self, primitive: Any, modes: tuple[int, ...]
+    ) -> tuple[np.ndarray, Int64[np.ndarray, "t 3"]]:
+        mode = get(primitive, "mode", int, _TRIANGLES)
+        if mode not in modes:
             return np.empty((0, 3)), np.empty((0, 3), np.int64)
-        attributes = _get(primitive, "attributes", dict)
-        points = as_float64(self._accessor(_get(attributes, "POSITION", int), "VEC3"))
+        attributes = get(primitive, "attributes", dict)
+        points = as_float64(self._accessor(get(attributes, "POSITION", int), "VEC3"))
         corners = np.arange(len(points))
         if "indices" in primitive:
-            corners = self._accessor(_get(primitive, "indices", int), "SCALAR")[:, 0]
+            corners = self._accessor(get(primitive, "indices", int), "SCALAR")[:, 0]
             if corners.dtype.kind == "f":
                 raise CloudFileError("the indices of a primitive are floats, wanted integers")
             corners = corners.astype(np.int64)
@@ -136,6 +150,8 @@ class _Scene:
                 raise CloudFileError(
                     f"a primitive names vertex {corners.max()}, wanted 0 to {len(points) - 1}"
                 )
+        if mode == _POINTS:
+            return points[corners], np.empty((0, 3), np.int64)
         if mode == _TRIANGLES:
             return points, corners[: len(corners) // 3 * 3].reshape(-1, 3)
         ends = np.arange(2, max(len(corners), 2))
@@ -147,15 +163,15 @@ class _Scene:
     def _accessor(self, index: int, kind: str) -> np.ndarray:
         """The rows an accessor stands for, (n, 1) or (n, 3), in floats or integers."""
         accessor = self._item("accessors", index)
-        code = _get(accessor, "componentType", int)
-        if _get(accessor, "type", str) != kind or code not in _COMPONENTS or "sparse" in accessor:
+        code = get(accessor, "componentType", int)
+        if get(accessor, "type", str) != kind or code not in _COMPONENTS or "sparse" in accessor:
             raise CloudFileError(f"accessor {index}: wanted {kind} of plain numbers")
         dtype, width = np.dtype(_COMPONENTS[code]), _WIDTHS[kind]
-        view = self._item("bufferViews", _get(accessor, "bufferView", int))
-        data = self._buffer(_get(view, "buffer", int))
-        begin, size = _get(view, "byteOffset", int, 0), _get(view, "byteLength", int)
-        skipped, count = _get(accessor, "byteOffset", int, 0), _get(accessor, "count", int)
-        stride = _get(view, "byteStride", int, dtype.itemsize * width)
+        view = self._item("bufferViews", get(accessor, "bufferView", int))
+        data = self._buffer(get(view, "buffer", int))
+        begin, size = get(view, "byteOffset", int, 0), get(view, "byteLength", int)
+        skipped, count = get(accessor, "byteOffset", int, 0), get(accessor, "count", int)
+        stride = get(view, "byteStride", int, dtype.itemsize * width)
         last = skipped + stride * (count - 1) + dtype.itemsize * width
         if (
             min(begin, skipped) < 0
@@ -170,13 +186,13 @@ class _Scene:
             )
         strides = (stride, dtype.itemsize)
         rows = np.ndarray((count, width), dtype, data, begin + skipped, strides)
-        if kind == "VEC3" and _get(accessor, "normalized", bool, False) and dtype.kind != "f":
+        if kind == "VEC3" and get(accessor, "normalized", bool, False) and dtype.kind != "f":
             rows = np.maximum(rows / np.iinfo(dtype).max, -1.0)
         return rows
 
     def _buffer(self, index: int) -> bytes:
         if index not in self.buffers:
-            uri = _get(self._item("buffers", index), "uri", str)
+            uri = get(self._item("buffers", index), "uri", str)
             if uri.startswith("data:"):
                 head, _, text = uri.partition(",")
                 try:
@@ -198,43 +214,9 @@ class _Scene:
             raise CloudFileError(f"buffer {index}: {uri[:80]!r} {error}") from None
 
     def _item(self, key: str, index: Any) -> dict:
-        items = _get(self.document, key, list)
+        items = get(self.document, key, list)
         if type(index) is not int or not 0 <= index < len(items):
             raise CloudFileError(f"{key}: wanted one of {len(items)}, got {str(index)[:40]}")
         if not isinstance(items[index], dict):
             raise CloudFileError(f"{key}: number {index} is no JSON object")
         return items[index]
-
-
-def _placement(node: dict) -> Float64[np.ndarray, "4 4"]:
-    """A node's transform, of its own frame into the one above."""
-    if "matrix" in node:
-        return _numbers(node, "matrix", [0.0] * 16).reshape(4, 4).T  # stored by columns
-    x, y, z, w = _numbers(node, "rotation", [0.0, 0.0, 0.0, 1.0])
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    placement = np.eye(4)
-    placement[:3, :3] = rotation * _numbers(node, "scale", [1.0, 1.0, 1.0])
-    placement[:3, 3] = _numbers(node, "translation", [0.0, 0.0, 0.0])
-    return placement
-
-
-def _numbers(node: dict, key: str, default: list[float]) -> Float64[np.ndarray, " k"]:
-    values = _get(node, key, list, default)
-    good = all(type(v) in (int, float) and abs(v) <= 1e15 for v in values)
-    if not good or len(values) != len(default):
-        raise CloudFileError(f"{key}: wanted {len(default)} finite numbers, got {str(values)[:80]}")
-    return np.array(values, dtype=np.float64)
-
-
-def _get(item: Any, key: str, kind: type[T], default: T | None = None) -> T:
-    """`item[key]`, of the kind it has to be; without a default it has to be there."""
-    value = item.get(key, default) if isinstance(item, dict) else None
-    if type(value) is not kind:
-        raise CloudFileError(f"{key}: wanted a JSON {kind.__name__}, got {str(value)[:40]!r}")
-    return value

@@ -1,0 +1,1 @@
+"""LAS, and LAZ, which is LAS compressed."""

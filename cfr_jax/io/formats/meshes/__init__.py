@@ -1,0 +1,1 @@
+"""Formats of meshes: OFF, OBJ, STL, and glTF."""

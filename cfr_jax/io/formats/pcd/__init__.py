@@ -1,0 +1,1 @@
+"""PCD: clouds of PCL, in text, binary, and compressed binary."""

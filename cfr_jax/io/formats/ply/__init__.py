@@ -1,0 +1,1 @@
+"""PLY: clouds and meshes, in text or binary."""

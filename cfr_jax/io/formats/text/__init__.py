@@ -1,0 +1,1 @@
+"""Points as text: one on a line, with or without names for the columns."""

@@ -1,0 +1,181 @@
+"""The rows of a text, block by block, so that memory stays near what the points take."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float64
+
+from cfr_jax.io.budget import check_room
+from cfr_jax.io.cloud import CloudFileError
+from cfr_jax.io.formats.text.dialect import Layout
+from cfr_jax.io.formats.text.lines import bad_line
+
+_BLOCK = 1 << 20
+_COMMENT = re.compile(rb"(#|//)[^\n]*")
+_CANNOT = re.compile(r"could not convert string .* at row \d+, column (\d+)")
+
+
+def read_numbers(
+    data: bytes, layout: Layout, columns: tuple[int, ...] | None
+) -> Float64[np.ndarray, "n c"]:
+    """The chosen columns of all rows as float64; all columns if None, which no row may lack."""
+    width = layout.width if columns is None else len(columns)
+    most = data.count(b"\n", layout.body) + 1
+    table = np.empty((most, width))
+    done = 0
+    for line, block in blocks(data, layout):
+        rows = _load(block, line, layout, columns, np.dtype(np.float64))
+        if len(rows) and rows.shape[1] != width:
+            raise _uneven(line)
+        check_room(done + len(rows), 8 * width, len(data), "rows of numbers and more")
+        table[done : done + len(rows)] = rows
+        done += len(rows)
+    return table[:done]
+
+
+def read_columns(data: bytes, layout: Layout) -> list[np.ndarray]:
+    """All columns, each in the narrowest type of int64, float64 and text that holds it."""
+    kinds = ["i8"] * layout.width
+    parts: list[list[np.ndarray]] = [[] for _ in kinds]
+    taken = 0
+    for line, block in blocks(data, layout):
+        for column, part in enumerate(_typed(block, line, layout, kinds)):
+            parts[column].append(part)
+            taken += part.nbytes + 8 * len(part) * (column < 3)  # and as points
+        check_room(taken, 1, len(data), "bytes of columns and more")
+    columns = []
+    for pieces in parts:
+        columns.append(np.concatenate(pieces) if pieces else np.empty(0))
+        pieces.clear()
+    return columns
+
+
+def _typed(block: bytes, line: int, layout: Layout, kinds: list[str]) -> list[np.ndarray]:
+    """The columns of a block; `kinds` are widened where they do not hold what comes."""
+    while True:
+        chosen = tuple(k for k, kind in enumerate(kinds) if kind != "U")
+        found: dict[int, np.ndarray] = {}
+        if chosen:
+            dtype = np.dtype([(f"f{k}", kinds[k]) for k in chosen])
+            try:
+                rows = _load(block, line, layout, chosen, dtype)
+            except _Unfit as unfit:
+                kinds[unfit.column] = "f8" if kinds[unfit.column] == "i8" else "U"
+                continue
+            found = {k: rows[f"f{k}"] for k in chosen}
+        words = [k for k, kind in enumerate(kinds) if kind == "U"]
+        if words:
+            cells = _cells(block, line, layout)
+            found |= {k: np.array([row[k].strip() for row in cells]) for k in words}
+        if len({len(values) for values in found.values()}) > 1:
+            raise _uneven(line)
+        return [found[k] for k in range(len(kinds))]
+
+
+def _cells(block: bytes, line: int, layout: Layout) -> list[list[str]]:
+    """The cells of a block's rows, as words."""
+    reader = csv.reader(
+        block.decode("utf-8", "replace").split("\n"),
+        delimiter=layout.delimiter or " ",
+        skipinitialspace=True,
+    )
+    try:
+        rows = [row for row in reader if row and (len(row) > 1 or row[0].strip())]
+    except csv.Error as error:
+        raise CloudFileError(f"behind line {line}: {error}") from None
+    if min(map(len, rows), default=layout.width) < layout.width:
+        raise _uneven(line)
+    return rows
+
+
+class _Unfit(ValueError):
+    """A cell that its column's type does not hold."""
+
+    def __init__(self, column: int) -> None:
+        super().__init__()
+        self.column = column
+
+
+def blocks(data: bytes, layout: Layout) -> Iterator[tuple[int, bytes]]:
+    """Whole lines of the body, a megabyte at a time, cleaned of comments and carriage returns.
+
+    With each comes the number of its first line. A file that says how many points it has ends
+    there.
+    """
+    start, line = layout.body, layout.line
+    left = layout.count
+    while start < len(data) and left != 0:
+        end = data.find(b"\n", start + _BLOCK)
+        end = len(data) if end < 0 else end + 1
+        block = data[start:end]
+        newlines = block.count(b"\n")
+        if b"\r" in block:
+            block = block.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+        if b"#" in block or b"//" in block:
+            block = _COMMENT.sub(b"", block)
+        if layout.commas_are_blanks:
+            block = block.replace(b",", b" ")
+        elif layout.decimal_comma:
+            block = block.replace(b",", b".")
+        if block.strip():
+            yield line, block
+        start, line = end, line + newlines
+
+
+def _load(
+    block: bytes, line: int, layout: Layout, columns: tuple[int, ...] | None, dtype: np.dtype
+) -> np.ndarray:
+    """Rows of a block by numpy's parser; a mistake is told by its line."""
+    if columns is None and layout.trailing:
+        columns = tuple(range(layout.width))
+    if columns is not None and not layout.quoted:
+        _check_widths(block, line, layout)
+    try:
+        return np.loadtxt(
+            io.BytesIO(block),
+            dtype,
+            comments=None,
+            delimiter=layout.delimiter,
+            usecols=columns,
+            ndmin=1 if dtype.names else 2,
+            encoding="utf-8" if layout.quoted else "latin1",
+            quotechar='"' if layout.quoted else None,
+        )
+    except ValueError as error:
+        told = _CANNOT.search(str(error))
+        if dtype.names and told is not None:
+            raise _Unfit(int(told[1]) - 1) from None
+        where = line + bad_line(block, layout.delimiter, columns)
+        raise CloudFileError(f"line {where}: {error}") from None
+
+
+def _check_widths(block: bytes, line: int, layout: Layout) -> None:
+    """Raises CloudFileError for the first line with more or fewer cells than the first row."""
+    raw = np.frombuffer(block, np.uint8)
+    ends = np.flatnonzero(raw == 10)
+    starts = np.concatenate([[0], ends + 1])
+    starts = starts[starts < len(raw)]
+    if layout.delimiter is None:
+        filled = raw > 32
+        filled[1:] &= ~(raw[:-1] > 32)
+        cells = np.add.reduceat(filled, starts, dtype=np.int32)
+        wrong = (cells != layout.width) & (cells > 0)
+    else:
+        marks = raw == ord(layout.delimiter)
+        cells = np.add.reduceat(marks, starts, dtype=np.int32) + 1
+        blank = np.maximum.reduceat(raw, starts) <= 32
+        wrong = (cells != layout.width + layout.trailing) & (cells != layout.width) & ~blank
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise CloudFileError(
+            f"line {line + row}: the number of columns changed from {layout.width} to {cells[row]}"
+        )
+
+
+def _uneven(line: int) -> CloudFileError:
+    return CloudFileError(f"behind line {line}: the number of columns changed")
