@@ -120,8 +120,8 @@ def find_cloud(document: dict[str, Any], role: str, result: Path, given: Path | 
         if os.path.exists(place):
             return place
     raise Refused(
-        f"{role}: {shown(noted)}, which {shown(result.name)} was made from, does not exist, nor does a "
-        f"file of that name beside the result; give --{role} FILE to say where it is now"
+        f"{role}: {shown(noted)}, which {shown(result.name)} was made from, does not exist, nor "
+        f"does a file of that name beside the result; give --{role} FILE to say where it is now"
     )
 
 
