@@ -120,6 +120,8 @@ class CsvPairs(PairFile):
             raise Refused(f"{shown(path)} is not a CSV list ({error})") from error
         except Refused as error:
             told = str(error)
+            if told == "is empty":
+                told = "lists no pairs; wanted lines of `source,target`"
             raise (error if shown(path) in told else Refused(f"{shown(path)} {told}")) from None
         if not self._sources:
             raise Refused(f"{shown(path)} lists no pairs; wanted lines of `source,target`")
