@@ -174,8 +174,13 @@ def _limit_memory(spare: int) -> None:
         return
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Serves on the standard streams."""
     # what a library prints must not get among the answers
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     serve(sys.stdin.buffer, answers)
+
+
+if __name__ == "__main__":
+    main()
