@@ -12,7 +12,6 @@ that cannot be read, the line gives the reason. The runner retries bundles if a 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
@@ -39,11 +38,12 @@ class Register(beam.DoFn):
     def process(self, bundle: list[Job]) -> Iterator[str]:
         """Registers the pairs of one bundle."""
         from cfr_jax import align_many
+        from cfr_jax.batch.journal import line_of
         from cfr_jax.batch.records import as_record
 
         pairs = [job.pair for job in bundle]
         for outcome in align_many(pairs, params=self._params, refine=self._refine):
-            yield json.dumps(as_record(bundle[outcome.index], outcome))
+            yield line_of(as_record(bundle[outcome.index], outcome)).decode().rstrip("\n")
 
 
 def bundles(jobs: list[Job], size: int) -> Iterator[list[Job]]:

@@ -4,8 +4,10 @@
     python run_exported.py model.stablehlo source.npy target.npy
 
 The clouds are (n, 3) arrays in the same unit. Prints the 4x4 motion of the source onto the target.
+The file is 32 bytes, the SHA-256 of the rest, and then the program as `jax.export` writes it.
 """
 
+import hashlib
 import sys
 
 import jax
@@ -36,8 +38,16 @@ def register(exported, source, target, seed=0):
     return motion
 
 
+def load(path):
+    """The exported program, after checking that no bit of it has changed."""
+    with open(path, "rb") as file:
+        digest, program = file.read(32), file.read()
+    if hashlib.sha256(program).digest() != digest:
+        raise ValueError(f"{path} is damaged, or cfr export did not write it")
+    return jax.export.deserialize(bytearray(program))
+
+
 if __name__ == "__main__":
-    with open(sys.argv[1], "rb") as file:
-        program = jax.export.deserialize(bytearray(file.read()))
+    program = load(sys.argv[1])
     np.set_printoptions(suppress=True)
     print(register(program, *(np.load(path)[:, :3].astype(float) for path in sys.argv[2:4])))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ from cfr_jax.alignment.refining import refine_every_point, refine_used_points
 from cfr_jax.alignment.search import search
 from cfr_jax.alignment.second_look import look_again
 from cfr_jax.alignment.solving import on_accelerator, solve_case
+from cfr_jax.networks.cfr.network import check_params
 from cfr_jax.networks.probability import calibration_of
 from cfr_jax.networks.record import Params
 from cfr_jax.refine import Refinement, find
@@ -127,10 +128,7 @@ def checked_params(params: Any) -> Params:
     """The weights that ship for None; raises ValueError for what are no parameters, and for a
     calibration made of other clues than `align` finds."""
     params = _default_params() if params is None else params
-    if not isinstance(params, Mapping):
-        raise ValueError(
-            f"params: got a {type(params).__name__}, wanted the parameters of load_params"
-        )
+    check_params(params)
     if (fitted := calibration_of(params)) is not None:
         fitted.check("align", confidence.NAMES)
     return dict(params)

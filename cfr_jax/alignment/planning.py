@@ -142,8 +142,11 @@ def whole_number(name: str, value: Any, *, least: int) -> int:
 def rigid_motions(initial: Any) -> Float[np.ndarray, "k 4 4"]:
     """One or several initial motions, float64; raises ValueError for anything else."""
     try:
-        given = np.asarray(initial, np.float64)
-    except (TypeError, ValueError):
+        given = np.asarray(initial)
+        if given.dtype.kind in "cOSUmM":  # numpy would make floats of complex numbers and texts
+            raise TypeError
+        given = given.astype(np.float64)
+    except (TypeError, ValueError, OverflowError):
         what = repr(initial) if isinstance(initial, str) else f"a {type(initial).__name__}"
         raise ValueError(
             f"initial: got {what} that is no array of numbers, "

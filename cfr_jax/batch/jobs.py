@@ -7,7 +7,9 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
+
+import numpy as np
 
 from cfr_jax.data.layout import Layout
 
@@ -32,7 +34,35 @@ class Job:
         return self.source, self.target, self.repeat
 
 
-def jobs_of(layout: Layout, target: Path | None = None) -> tuple[list[Job], str]:
+class Jobs(Sequence[Job]):
+    """The pairs of a list, of which only how often each was listed before is in memory."""
+
+    def __init__(self, names: Sequence[Sequence[str]], pairs: Sequence[Any]):
+        self._names, self._pairs = names, pairs
+        self._repeats = _repeats(names)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    @overload
+    def __getitem__(self, index: int) -> Job: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Job]: ...
+
+    def __getitem__(self, index: int | slice) -> Job | list[Job]:
+        if isinstance(index, slice):
+            return [self[row] for row in range(len(self))[index]]
+        return Job(*self.key(index), self._pairs[index])
+
+    def key(self, row: int) -> tuple[str, str, int]:
+        """`Job.key` of a row, without its pair."""
+        row = range(len(self))[row]
+        source, target = self._names[row]
+        return source, target, int(self._repeats[row])
+
+
+def jobs_of(layout: Layout, target: Path | None = None) -> tuple[Jobs, str]:
     """The pairs of recognized data, in order, and a phrase that says what was paired with what.
 
     With `target`, every cloud of a folder is registered onto that one file. Raises ValueError if
@@ -45,7 +75,7 @@ def jobs_of(layout: Layout, target: Path | None = None) -> tuple[list[Job], str]
         )
     if kind.list_pairs is not None:
         listing = kind.list_pairs(layout.path)
-        return _numbered(listing.names, listing.pairs), listing.how
+        return Jobs(listing.names, listing.pairs), listing.how
     if kind.list_scans is not None:
         return _of_files(layout, kind.list_scans(layout.path), target)
     raise ValueError(
@@ -54,7 +84,7 @@ def jobs_of(layout: Layout, target: Path | None = None) -> tuple[list[Job], str]
     )
 
 
-def _of_files(layout: Layout, files: list[Path], target: Path | None) -> tuple[list[Job], str]:
+def _of_files(layout: Layout, files: list[Path], target: Path | None) -> tuple[Jobs, str]:
     folder = layout.path
     if target is not None:
         if not target.is_file():
@@ -76,7 +106,7 @@ def _of_files(layout: Layout, files: list[Path], target: Path | None) -> tuple[l
             "give --target FILE, or a CSV list of `source,target` lines"
         )
     names = [tuple(_inside(folder, file) for file in place) for place in places]
-    return _numbered(names, places), how
+    return Jobs(names, places), how
 
 
 def _by_name(folder: Path, files: list[Path]) -> list[tuple[Path, Path]]:
@@ -101,10 +131,14 @@ def _inside(folder: Path, file: Path) -> str:
     return str(file.relative_to(folder)) if file.is_relative_to(folder) else str(file)
 
 
-def _numbered(names: Sequence[Sequence[str]], pairs: Sequence[Any]) -> list[Job]:
-    seen: Counter[tuple[str, str]] = Counter()
-    jobs = []
-    for (source, target), pair in zip(names, pairs, strict=True):
-        jobs.append(Job(source, target, seen[source, target], pair))
-        seen[source, target] += 1
-    return jobs
+def _repeats(names: Sequence[Sequence[str]]) -> np.ndarray:
+    """How many pairs of the same names come before each."""
+    repeats = np.zeros(len(names), np.uint32)
+    hashes = np.fromiter((hash(tuple(pair)) for pair in names), np.int64, len(names))
+    _, group, sizes = np.unique(hashes, return_inverse=True, return_counts=True)
+    seen: Counter[tuple[str, ...]] = Counter()
+    for row in np.flatnonzero(sizes[group] > 1).tolist():  # few, and equal ones are among them
+        pair = tuple(names[row])
+        repeats[row] = seen[pair]
+        seen[pair] += 1
+    return repeats

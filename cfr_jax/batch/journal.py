@@ -1,19 +1,36 @@
-"""The results of all pairs, one JSON line each, so that a killed run loses no answer.
+"""What became of each pair, one JSON line each, so that no kill loses an answer.
 
-A line is written in one piece as soon as its pair is done. If a kill cut off the last line, it is
-removed when the file is opened again. The first line says what the answers were made with.
+A line is written in one go as soon as its pair is done, with a checksum. A line that a kill cut
+short is found when the file is opened again, and taken off; one that was changed is refused. The
+first line says what the answers were made with. In memory is only where each line is.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from cfr_jax.runtime.reading import irregular, opened, parse_json
+from cfr_jax.runtime.words import Refused, shown
+
 Key = tuple[str, str, int]
+_CHECK = 16  # hexadecimal digits
+_END = re.compile(rb', "check": "([0-9a-f]{%d})"}\n' % _CHECK)
+_END_SIZE = len(', "check": ""}\n') + _CHECK
+_LONGEST_LINE = 1 << 26  # bytes; a record has a few thousand
+
+
+def line_of(value: dict[str, Any]) -> bytes:
+    """A record as a line of a journal. Its last member, `check`, is the start of the SHA-256 of the
+    line without it."""
+    bare = json.dumps(value, allow_nan=False).encode()
+    return bare[:-1] + f', "check": "{_check(bare)}"}}\n'.encode()
 
 
 class Journal:
@@ -26,18 +43,20 @@ class Journal:
         retry: bool = False,
         command: str = "batch",
     ):
-        """Opens the journal at `path`, or creates it.
-
-        With `retry`, pairs that failed count as not done. `command` of `cfr` writes it. Raises
-        ValueError if another process has the file open, if it was made with other settings, or if
-        it is not a journal.
-        """
+        """Opens the journal at `path`, or begins it. With `retry`, pairs that failed count as not
+        done; `command` of `cfr` writes it. Raises ValueError if another process has it open, if it
+        was made with other settings, if it is no journal, or if a line of it is damaged."""
         self.path = path
         self._command = command
-        self._format = f"cfr_jax/{command}/1"
-        self.done: dict[Key, dict[str, Any]] = {}
+        self._format = f"cfr_jax/{command}/2"
+        self._places: dict[Key, tuple[Path, int]] = {}
+        self._failed: set[Key] = set()
         header = {"format": self._format, "made_with": made_with}
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        if (kind := irregular(path)) is not None:
+            raise Refused(f"{shown(path)} is not a regular file but {kind}")
+        with _said(path):
+            flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NONBLOCK", 0)
+            self._file = os.open(path, flags, 0o666)
         try:
             self._lock()
             self._open(header)
@@ -45,9 +64,8 @@ class Journal:
             self.close()
             raise
         if retry:
-            self.done = {
-                key: record for key, record in self.done.items() if record["error"] is None
-            }
+            for key in self._failed:
+                del self._places[key]
 
     def __enter__(self) -> Journal:
         return self
@@ -55,85 +73,184 @@ class Journal:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def __contains__(self, key: Key) -> bool:
+        """Whether the pair is done."""
+        return key in self._places
+
+    def __iter__(self) -> Iterator[Key]:
+        """The pairs that are done."""
+        return iter(self._places)
+
+    def __getitem__(self, key: Key) -> dict[str, Any]:
+        """The record of a pair that is done, read again; raises ValueError if it was changed."""
+        path, start = self._places[key]
+        with _said(path), opened(path) as stream:
+            stream.seek(start)
+            return _record(stream.readline(_LONGEST_LINE), f"{shown(path)}, byte {start}")
+
     def close(self) -> None:
-        """Closes the file, so that other processes can open it."""
+        """Lets others open the file."""
         with contextlib.suppress(OSError):
             os.close(self._file)
 
     def adopt(self, path: Path, made_with: dict[str, Any]) -> None:
-        """Also counts the pairs in another journal as done; it must have the same settings.
-
-        Raises ValueError if it has other settings or is not a journal.
-        """
-        records = _records(path)
-        header = next(records, {})
-        if header.get("format") != self._format or "made_with" not in header:
-            raise ValueError(
-                f"{path} exists, but is not a journal of `cfr {self._command}`\n"
-                "move it, or choose another --out"
+        """Also takes for done what another journal of the same settings holds."""
+        with _said(path):
+            records = _records(path)
+            start, header = next(records, (0, {}))
+        if header.get("format") != self._format or not isinstance(header.get("made_with"), dict):
+            older = str(header.get("format")).startswith(f"cfr_jax/{self._command}/")
+            what = (
+                "a journal of another version"
+                if older
+                else f"not a journal of `cfr {self._command}`, or damaged"
             )
+            raise Refused(f"{shown(path)} exists, but is {what}\nmove it, or choose another --out")
         theirs = header["made_with"]
         differing = [name for name in made_with if theirs.get(name) != made_with[name]]
         if differing:
             name = differing[0]
-            raise ValueError(
-                f"{path} was started with {name} {theirs.get(name)!r}, not {made_with[name]!r}\n"
+            raise Refused(
+                f"{shown(path)} was started with {name} {shown(repr(theirs.get(name)), 80)}, "
+                f"not {made_with[name]!r}\n"
                 "give the same options to continue, remove it to start over, or choose another "
                 "--out"
             )
-        for record in records:
-            # For a pair that was tried again, the last line counts.
-            self.done[record["source"], record["target"], record["repeat"]] = record
+        with _said(path):
+            for start, record in records:
+                self._note(record, path, start)  # of a pair that was tried again, the last counts
 
     def _open(self, header: dict[str, Any]) -> None:
-        data, start = self.path.read_bytes(), (json.dumps(header) + "\n").encode()
-        whole = data.rfind(b"\n") + 1
-        if whole or not start.startswith(data):
-            self.adopt(self.path, header["made_with"])  # before the file is changed at all
-        os.ftruncate(self._file, whole)
-        os.lseek(self._file, 0, os.SEEK_END)
+        start = line_of(header)
+        if os.fstat(self._file).st_size:
+            with _said(self.path), opened(self.path) as stream:
+                begun = stream.read(len(start))
+        else:
+            begun = b""
+        whole = self._size_of_whole_lines()
+        if whole or not start.startswith(begun):
+            self.adopt(self.path, header["made_with"])  # before anything of it is changed
+        if whole < os.fstat(self._file).st_size:
+            with _said(self.path):
+                os.ftruncate(self._file, whole)
         if not whole:
             self._append(header)
 
-    def write(self, record: dict[str, Any]) -> None:
-        """Adds the record of a pair, and counts it as done once it is on its way to the disk."""
-        self._append(record)
-        self.done[record["source"], record["target"], record["repeat"]] = record
+    def _size_of_whole_lines(self) -> int:
+        """Bytes up to the end of the last whole line."""
+        end = os.fstat(self._file).st_size
+        while end:
+            size = min(end, 1 << 16)
+            os.lseek(self._file, end - size, os.SEEK_SET)
+            found = os.read(self._file, size).rfind(b"\n")
+            if found >= 0:
+                return end - size + found + 1
+            end -= size
+        return 0
 
-    def _append(self, value: dict[str, Any]) -> None:
-        line = memoryview((json.dumps(value, allow_nan=False) + "\n").encode())
-        while line:  # a signal or a full disk may cut a write short
-            line = line[os.write(self._file, line) :]
+    def write(self, record: dict[str, Any]) -> None:
+        """Adds the record of a pair, and takes it for done once it is on its way to the disk.
+
+        Raises OSError if that is not possible, and if the file was removed meanwhile.
+        """
+        self._note(record, self.path, self._append(record))
+
+    def _note(self, record: dict[str, Any], path: Path, start: int) -> None:
+        key = record["source"], record["target"], record["repeat"]
+        self._places[key] = path, start
+        (self._failed.discard if record["error"] is None else self._failed.add)(key)
+
+    def _append(self, value: dict[str, Any]) -> int:
+        """Where the line of the value starts."""
+        line, start = memoryview(line_of(value)), None
+        try:
+            mine, there = os.fstat(self._file), os.stat(self.path)
+            if (mine.st_dev, mine.st_ino) != (there.st_dev, there.st_ino):
+                raise FileNotFoundError(2, "it was replaced by another file")
+            start = os.lseek(self._file, 0, os.SEEK_END)
+            while line:  # a signal or a full disk may cut a write short
+                line = line[os.write(self._file, line) :]
+        except OSError as error:
+            if start is not None:
+                with contextlib.suppress(OSError):
+                    os.ftruncate(self._file, start)  # no half line, should anybody go on
+            raise OSError(
+                f"{shown(self.path)} can no longer be written ({error.strerror})\n"
+                "make room or put its folder back; the same command goes on from what is there"
+            ) from error
+        return start
 
     def _lock(self) -> None:
         try:
             import fcntl
-        except ImportError:  # Windows: nothing there keeps two runs from writing one file
+        except ImportError:  # Windows: whoever starts two of one name there has to know better
             return
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(
-                f"{self.path} is being written by another `cfr {self._command}`\n"
+            raise Refused(
+                f"{shown(self.path)} is being written by another `cfr {self._command}`\n"
                 "wait for it, choose another --out, or split the work with --shard"
             ) from None
         except OSError:  # file systems without locks
             return
 
 
-def _records(path: Path) -> Iterator[dict[str, Any]]:
-    with open(path, "rb") as stream:
-        for number, line in enumerate(stream, 1):
-            if not line.endswith(b"\n"):  # still being written, by another shard
-                return
+def _check(bare: bytes) -> str:
+    return hashlib.sha256(bare).hexdigest()[:_CHECK]
+
+
+@contextlib.contextmanager
+def _said(path: Path) -> Iterator[None]:
+    """Within, a file that cannot be opened or read is named."""
+    try:
+        yield
+    except OSError as error:
+        raise Refused(f"{shown(path)} cannot be opened: {error.strerror}") from error
+    except Refused as error:
+        told = str(error)
+        raise (error if shown(path) in told else Refused(f"{shown(path)} {told}")) from error
+
+
+def _records(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Each record, the header first, with the byte where its line starts."""
+    with opened(path) as stream:
+        start, number = 0, 0
+        while line := stream.readline(_LONGEST_LINE):
+            if not line.endswith(b"\n") and len(line) < _LONGEST_LINE:
+                return  # still being written, by another shard
+            number += 1
             try:
-                record = json.loads(line)
-                if not isinstance(record, dict) or (number > 1 and "source" not in record):
-                    raise ValueError("it is not a record of a pair")
-            except ValueError as error:
+                yield start, _record(line, f"{shown(path)}, line {number}", header=number == 1)
+            except Refused:
                 if number == 1:
                     return
-                raise ValueError(
-                    f"{path}, line {number} is damaged ({error}): remove the line"
-                ) from None
-            yield record
+                raise
+            start += len(line)
+
+
+def _record(line: bytes, where: str, header: bool = False) -> dict[str, Any]:
+    """The value of a line whose checksum fits."""
+    try:
+        end = _END.fullmatch(line[-_END_SIZE:])
+        if end is None or _check(line[:-_END_SIZE] + b"}").encode() != end[1]:
+            if header and line.startswith(b'{"format": "cfr_jax/batch/1"'):
+                return parse_json(line)  # of the version without checksums
+            raise Refused("its checksum does not fit")
+        record = parse_json(line)
+        if not header and not _is_record(record):
+            raise Refused("it is not a record of a pair")
+    except Refused as error:
+        raise Refused(
+            f"{where} is damaged ({error}): remove the line, and its pair is registered again"
+        ) from None
+    return record
+
+
+def _is_record(value: Any) -> bool:
+    return (
+        isinstance(value, dict)
+        and all(isinstance(value.get(name), str) for name in ("source", "target"))
+        and isinstance(value.get("repeat"), int)
+        and isinstance(value.get("error", 0), str | None)
+    )

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TextIO
 
 from cfr_jax.batch.jobs import Job
 from cfr_jax.batch.stream import Outcome
+from cfr_jax.runtime.words import escaped
 
 _FIGURES = ("trusted", "confidence", "determined", "fitness", "inlier_rmse", "inlier_distance")
 _CELLS = tuple(f"t{row}{column}" for row in range(4) for column in range(4))
+# The wide forms count as the others where texts are Chinese or Japanese.
+_RUN_BY_SPREADSHEETS = ("=", "+", "-", "@", "\n", "＝", "＋", "－", "＠")
 COLUMNS = ("source", "target", "status", *_FIGURES, *_CELLS, "remarks")
 
 
@@ -41,22 +43,31 @@ def as_record(job: Job, outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def as_table(records: Iterable[dict[str, Any]]) -> str:
-    """CSV with a header. Numbers keep all their digits; failed pairs have only the reason."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
+def write_table(stream: TextIO, records: Iterable[dict[str, Any]]) -> None:
+    """CSV with a header; numbers keep all their digits, and failed pairs have the reason alone.
+
+    Spreadsheets run a cell that starts with one of `= + - @`, so names and remarks that do get an
+    apostrophe in front, and control characters are escaped.
+    """
+    writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
-    for record in records:
-        names = [record["source"], record["target"]]
-        if record["error"] is not None:
-            empty = [""] * (len(_FIGURES) + len(_CELLS))
-            writer.writerow([*names, "failed", *empty, record["error"]])
-            continue
-        figures = [_cell(record[name]) for name in _FIGURES]
-        cells = [value for row in record["transform"] for value in row]
-        writer.writerow([*names, "ok", *figures, *cells, "; ".join(record["warnings"])])
-    return text.getvalue()
+    writer.writerows(map(_row, records))
+
+
+def _row(record: dict[str, Any]) -> list[Any]:
+    names = [_text(record["source"]), _text(record["target"])]
+    if record["error"] is not None:
+        empty = [""] * (len(_FIGURES) + len(_CELLS))
+        return [*names, "failed", *empty, _text(record["error"])]
+    figures = [_cell(record[name]) for name in _FIGURES]
+    cells = [value for row in record["transform"] for value in row]
+    return [*names, "ok", *figures, *cells, _text("; ".join(record["warnings"]))]
 
 
 def _cell(value: Any) -> Any:
     return str(value).lower() if isinstance(value, bool) else value
+
+
+def _text(value: str) -> str:
+    value = escaped(value)  # a bare carriage return, which `csv` does not quote, begins a row
+    return f"'{value}" if value.startswith(_RUN_BY_SPREADSHEETS) else value

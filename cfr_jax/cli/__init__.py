@@ -26,6 +26,7 @@ from cfr_jax.cli import (
     reproduce,
     view,
 )
+from cfr_jax.runtime.words import tidy
 
 _COMMANDS = (
     register,
@@ -67,7 +68,6 @@ environment:
 INTERRUPTED = 130
 READER_GONE = 141
 UNUSABLE = 2
-_MOST_LINES = 3
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -128,8 +128,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _complaint(where: str, message: str, *hints: str) -> str:
-    lines = [f"{where}: error: {message}", *hints]
-    return "\n".join("\n".join(lines).splitlines()[:_MOST_LINES])
+    return tidy("\n".join([f"{where}: error: {message}", *hints]))
 
 
 def make_parser() -> argparse.ArgumentParser:

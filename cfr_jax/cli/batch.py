@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +14,7 @@ from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.data import kinds
 
 if TYPE_CHECKING:
-    from cfr_jax.batch.jobs import Job
+    from cfr_jax.batch.jobs import Jobs
     from cfr_jax.batch.journal import Journal
     from cfr_jax.networks.record import Params
 
@@ -31,7 +33,9 @@ one before it.
 This writes two files. results.jsonl holds the full report, one line per pair, written as soon as
 the pair is done. results.csv is a table in the order of the pairs, written when all are done. After
 a crash, a kill or Ctrl-C, run the same command again, and it continues where it stopped. A pair
-that cannot be read becomes a row with the reason, and does not stop the others.
+that cannot be read becomes a row with the reason, and does not stop the others. Each line has a
+checksum: a changed one is refused. In the table, names that a spreadsheet would run as a formula
+get an apostrophe in front.
 """
 
 _EPILOG = """\
@@ -138,10 +142,10 @@ def run(args: argparse.Namespace) -> int:
     shard = asked_share(args.shard)
     print(f"recognized  {layout}")
     print(f"pairs       {len(jobs)}: {how}")
-    out = args.out
+    out, rows = args.out, range(len(jobs))
     if shard is not None:
-        jobs, out = jobs[shard.rows()], shard.beside(args.out)
-        print(f"shard       {shard.number} of {shard.count}: {len(jobs)} pairs")
+        rows, out = rows[shard.rows()], shard.beside(args.out)
+        print(f"shard       {shard.number} of {shard.count}: {len(rows)} pairs")
 
     from cfr_jax.batch.journal import Journal
     from cfr_jax.batch.sharding import other_shards
@@ -164,11 +168,11 @@ def run(args: argparse.Namespace) -> int:
     with Journal(kept, made_with, retry=args.retry_failed) as journal:
         for other in other_shards(kept) if shard is None else ():
             journal.adopt(other, made_with)
-        left = [job for job in jobs if job.key not in journal.done]
-        if len(left) < len(jobs):
-            print(f"done before {len(jobs) - len(left)}")
+        left = array("Q", (row for row in rows if jobs.key(row) not in journal))
+        if len(left) < len(rows):
+            print(f"done before {len(rows) - len(left)}")
         try:
-            _register(left, journal, weights.params, args)
+            _register(jobs, left, journal, weights.params, args)
         except KeyboardInterrupt:
             print(
                 f"cfr batch: stopped; {kept} keeps what is done\n"
@@ -176,11 +180,12 @@ def run(args: argparse.Namespace) -> int:
                 file=sys.stderr,
             )
             raise
-        records = [journal.done[job.key] for job in jobs]
-    return _tell(records, out, kept, args.strict)
+        return _tell((journal[jobs.key(row)] for row in rows), out, kept, args.strict)
 
 
-def _register(left: list[Job], journal: Journal, params: Params, args: argparse.Namespace) -> None:
+def _register(
+    jobs: Jobs, left: Sequence[int], journal: Journal, params: Params, args: argparse.Namespace
+) -> None:
     from cfr_jax.batch.records import as_record
     from cfr_jax.batch.stream import align_many
     from cfr_jax.runtime.progress import Progress
@@ -188,7 +193,7 @@ def _register(left: list[Job], journal: Journal, params: Params, args: argparse.
     if not left:
         return
     outcomes = align_many(
-        clouds.with_columns((job.pair for job in left), args),
+        clouds.with_columns((jobs[row].pair for row in left), args),
         params=params,
         refine=not args.no_refine,
         second_look=not args.no_second_look,
@@ -202,30 +207,46 @@ def _register(left: list[Job], journal: Journal, params: Params, args: argparse.
     failed = 0
     with Progress(total=len(left), desc="registering", unit=" pairs") as bar:
         for outcome in outcomes:
-            journal.write(as_record(left[outcome.index], outcome))
+            journal.write(as_record(jobs[left[outcome.index]], outcome))
             failed += outcome.error is not None
             if failed:
                 bar.set_postfix_str(f"{failed} failed", refresh=False)
             bar.update()
 
 
-def _tell(records: list[dict[str, Any]], out: Path, kept: Path, strict: bool) -> int:
-    from cfr_jax.batch.records import as_table
-    from cfr_jax.runtime.atomic import write_atomically
+def _tell(records: Iterable[dict[str, Any]], out: Path, kept: Path, strict: bool) -> int:
+    """Writes the table, and says what became of the pairs; each record is in memory by itself."""
+    from cfr_jax.batch.records import write_table
+    from cfr_jax.runtime.atomic import unfinished
+    from cfr_jax.runtime.words import shown
 
-    write_atomically(out, as_table(records).encode())
-    failed = [record for record in records if record["error"] is not None]
-    trusted = sum(bool(record["trusted"]) for record in records)
-    print(f"registered  {len(records) - len(failed)}, of these {trusted} trusted")
-    for record in failed[:3]:
-        print(f"failed      {record['source']} -> {record['target']}: {record['error']}")
-    if len(failed) > 3:
-        print(f"failed      {len(failed) - 3} more, see {out}")
+    count = failed = trusted = 0
+    reasons: list[tuple[str, str]] = []
+
+    def counted() -> Iterator[dict[str, Any]]:
+        nonlocal count, failed, trusted
+        for record in records:
+            count += 1
+            trusted += bool(record["trusted"])
+            if record["error"] is not None:
+                failed += 1
+                if len(reasons) < 3:
+                    pair = f"{shown(record['source'])} -> {shown(record['target'])}"
+                    reasons.append((pair, shown(record["error"], 600)))
+            yield record
+
+    with unfinished(out) as beside, open(beside, "w", encoding="utf-8", newline="") as stream:
+        write_table(stream, counted())
+    print(f"registered  {count - failed}, of these {trusted} trusted")
+    for pair, reason in reasons:
+        print(f"failed      {pair}: {reason}")
+    if failed > len(reasons):
+        print(f"failed      {failed - len(reasons)} more, see {out}")
     print(f"wrote       {out}")
     print(f"wrote       {kept}")
-    if records and len(failed) == len(records):
+    if count and failed == count:
         raise ValueError(
-            f"none of the {len(records)} pairs could be registered: {failed[0]['error']}\n"
+            f"none of the {count} pairs could be registered: {reasons[0][1]}\n"
             f"fix the files and add --retry-failed; every reason is in {out}"
         )
-    return UNTRUSTED if strict and trusted < len(records) else 0
+    return UNTRUSTED if strict and trusted < count else 0

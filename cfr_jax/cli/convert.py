@@ -51,13 +51,14 @@ def run(args: argparse.Namespace) -> int:
 
     from cfr_jax import __version__
     from cfr_jax.networks import table
+    from cfr_jax.runtime.reading import contents
     from cfr_jax.weights.authors import convert
     from cfr_jax.weights.files import network_of, read_weights, save_params
 
     params = convert(args.checkpoint)
     notes = {
         "converted_from": args.checkpoint.name,
-        "converted_from_sha256": sha256(args.checkpoint.read_bytes()).hexdigest(),
+        "converted_from_sha256": sha256(contents(args.checkpoint)).hexdigest(),
         "converted_by": f"cfr_jax {__version__}",
     }
     save_params(args.out, params, notes)

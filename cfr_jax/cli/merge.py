@@ -171,8 +171,8 @@ def run(args: argparse.Namespace) -> int:
     with Journal(kept, made_with, retry=args.retry_failed, command="merge") as journal:
         for other in other_shards(kept) if share is None else ():
             journal.adopt(other, made_with)
-        if journal.done:
-            print(f"done before {len(journal.done)} pairs")
+        if before := len(list(journal)):
+            print(f"done before {before} pairs")
         try:
             if share is not None:
                 count = merging.register_share(files, share.rows(), kept=journal, **options)

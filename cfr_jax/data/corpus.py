@@ -12,13 +12,21 @@ Several files can form one corpus. Their categories are matched by name.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 from jaxtyping import Float, Float32, Int
+
+from cfr_jax.data.hdf5 import reading as hdf5
+from cfr_jax.io.cloud import LARGEST_COORDINATE
+from cfr_jax.runtime.reading import text
+from cfr_jax.runtime.words import Refused, shown
+
+_LARGEST_LABEL = 65_535  # where no file lists the categories
+_LARGEST_LIST = 1 << 20  # bytes
 
 LAYOUT = (
     "A corpus is an HDF5 file with `data` (S, P, 3), `normal` (S, P, 3) and `label` (S,), "
@@ -118,41 +126,54 @@ def _files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
 
 
 def _read_file(path: Path) -> Corpus:
-    if not path.is_file():
-        raise ValueError(f"no corpus at {path}. {LAYOUT}")
+    if not os.path.exists(path):
+        raise Refused(f"no corpus at {shown(path)}. {LAYOUT}")
     try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        raise ValueError(f"{path} is not an HDF5 file ({error}). {LAYOUT}") from error
-    with file:
-        missing = [key for key in ("data", "normal", "label") if key not in file]
-        if missing:
-            raise ValueError(f"{path} lacks {missing}, and holds only {sorted(file)}. {LAYOUT}")
-        points = file["data"][()].astype(np.float32)
-        scale = np.float32(file["normal"].attrs.get("scale", 1.0))
-        normals = file["normal"][()].astype(np.float32) * scale
-        labels = file["label"][()].reshape(-1).astype(np.int64)
-        names = file["names"].asstr()[()] if "names" in file else None
-
-    if points.ndim != 3 or points.shape[-1] != 3 or 0 in points.shape:
-        raise ValueError(f"{path}: `data` has shape {points.shape}, wanted (S, P, 3)")
-    if normals.shape != points.shape:
-        raise ValueError(
-            f"{path}: `normal` has shape {normals.shape}, wanted that of `data`, {points.shape}"
+        held = hdf5.read(
+            path,
+            arrays=("data", "normal", "label"),
+            texts=("names",),
+            attributes=[("normal", "scale")],
         )
-    if len(labels) != len(points):
-        raise ValueError(f"{path}: {len(labels)} labels for {len(points)} shapes")
+    except Refused as error:
+        raise Refused(f"{error}. {LAYOUT}") from error
+    try:
+        return _corpus_of(held, path)
+    except ValueError as error:
+        raise Refused(f"{shown(path)}: {error}") from error
+
+
+def _corpus_of(held: hdf5.Held, path: Path) -> Corpus:
+    missing = [key for key in ("data", "normal", "label") if key not in held.arrays]
+    if missing:
+        raise Refused(f"it lacks {missing}, and holds only {sorted(held.names)}. {LAYOUT}")
+    points, normals, labels = (held.arrays[key] for key in ("data", "normal", "label"))
+    names = held.texts.get("names")
+    if points.ndim != 3 or points.shape[-1] != 3 or 0 in points.shape:
+        raise Refused(f"`data` has shape {points.shape}, wanted (S, P, 3)")
+    if normals.shape != points.shape:
+        raise Refused(f"`normal` has shape {normals.shape}, wanted that of `data`, {points.shape}")
+    if labels.dtype.kind not in "iu":
+        raise Refused(f"`label` is {labels.dtype}, wanted integers")
+    if labels.size != len(points):
+        raise Refused(f"{labels.size} labels for {len(points)} shapes")
     if names is not None and len(names) != len(points):
-        raise ValueError(f"{path}: {len(names)} names for {len(points)} shapes")
+        raise Refused(f"{len(names)} names for {len(points)} shapes")
+    with np.errstate(over="ignore"):
+        points = points.astype(np.float32)
+        normals = normals.astype(np.float32) * np.float32(held.attributes.get("normal@scale", 1.0))
     for key, values in (("data", points), ("normal", normals)):
         if not np.isfinite(values).all():
-            raise ValueError(f"{path}: `{key}` holds numbers that are not finite")
+            raise Refused(f"`{key}` holds numbers that are not finite in float32")
+        if np.abs(values).max() > LARGEST_COORDINATE:  # whose squares are no float32 any more
+            raise Refused(f"`{key}` holds numbers beyond ±{LARGEST_COORDINATE:g}")
+    labels = labels.reshape(-1)
     return Corpus(
         points=points,
         normals=_unit(normals),
-        labels=labels,
+        labels=labels.astype(np.int64),
         names=tuple(names) if names is not None else _row_names(path, len(points)),
-        categories=_categories(path, labels),
+        categories=_categories(path, int(labels.min()), int(labels.max())),
     )
 
 
@@ -165,16 +186,25 @@ def _row_names(path: Path, count: int) -> tuple[str, ...]:
     return tuple(f"{path.name}:{row}" for row in range(count))
 
 
-def _categories(path: Path, labels: Int[np.ndarray, " s"]) -> tuple[str, ...]:
-    if labels.min() < 0:
-        raise ValueError(f"{path}: label {labels.min()} is negative")
+def _categories(path: Path, least: int, most: int) -> tuple[str, ...]:
+    """The names of the categories, for labels in this range."""
+    if least < 0:
+        raise Refused(f"label {least} is negative")
     listed = path.parent / "shape_names.txt"
-    if not listed.is_file():
-        return tuple(str(label) for label in range(labels.max() + 1))
-    categories = tuple(line.strip() for line in listed.read_text().splitlines() if line.strip())
-    if labels.max() >= len(categories):
-        raise ValueError(
-            f"{path}: label {labels.max()} has no line in {listed}, which lists {len(categories)} "
-            "categories"
+    if not os.path.exists(listed):
+        if most > _LARGEST_LABEL:
+            raise Refused(
+                f"label {most} is larger than {_LARGEST_LABEL}; wanted the numbers of categories "
+                "from 0 on"
+            )
+        return tuple(str(label) for label in range(most + 1))
+    try:
+        lines = text(listed, _LARGEST_LIST).splitlines()
+    except Refused as error:
+        raise Refused(f"{shown(listed)}: {error}") from error
+    categories = tuple(line.strip() for line in lines if line.strip())
+    if most >= len(categories):
+        raise Refused(
+            f"label {most} has no line in {shown(listed)}, which lists {len(categories)} categories"
         )
     return categories

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from cfr_jax.io.formats import Format, by_suffix
+from cfr_jax.runtime.reading import opened
+from cfr_jax.runtime.words import Refused
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 _START = 4096  # bytes that are enough to see whether a file has faces
@@ -67,21 +69,21 @@ def in_words(name: str, counts: Counter[str]) -> str | None:
 
 def hdf5_members(path: Path) -> tuple[list[str], list[str]]:
     """Names of all members of an HDF5 file, and of its groups; both empty for any other file."""
-    import h5py
+    from cfr_jax.data.hdf5 import reading
 
-    if not path.is_file() or not h5py.is_hdf5(path):
+    if not reading.is_hdf5(path):
         return [], []
     try:
-        with h5py.File(path, "r") as file:
-            return list(file), [name for name, value in file.items() if hasattr(value, "keys")]
-    except OSError:
+        held = reading.read(path, groups=True)
+    except Refused:
         return [], []
+    return held.names, held.groups
 
 
 def _has_faces(form: Format, path: Path) -> bool:
     assert form.has_faces is not None  # only such formats are asked
     try:
-        with open(path, "rb") as stream:
+        with opened(path) as stream:
             return form.has_faces(stream.read(_START))
-    except OSError:
+    except (Refused, OSError):
         return False

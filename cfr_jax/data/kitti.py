@@ -30,6 +30,8 @@ from cfr_jax.data.scans import estimate_normals, refine_point_to_plane, voxel_me
 from cfr_jax.geometry import motions
 from cfr_jax.runtime.atomic import unfinished
 from cfr_jax.runtime.progress import Progress
+from cfr_jax.runtime.reading import text
+from cfr_jax.runtime.words import Refused, shown
 
 VOXEL = 0.3  # m
 NORMAL_RADIUS = 3.0  # m
@@ -191,11 +193,11 @@ def _numbers(
 ) -> Float[np.ndarray, "n 12"]:
     if not path.is_file():
         raise ValueError(f"no {path}. {LAYOUT}")
-    rows = [parts(line) for line in path.read_text().splitlines()]
     try:
+        rows = [parts(line) for line in text(path).splitlines()]
         values = np.array([[float(x) for x in row] for row in rows if row])
     except ValueError as error:
-        raise ValueError(f"{path}: {error}; wanted {wanted}") from error
+        raise Refused(f"{shown(path)}: {error}; wanted {wanted}") from error
     if values.ndim != 2 or values.shape[1] != 12 or not np.isfinite(values).all():
         raise ValueError(f"{path} is malformed; wanted {wanted}")
     return values

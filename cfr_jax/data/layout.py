@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 from cfr_jax.data import kinds
 from cfr_jax.data.kinds.kind import DataKind
+from cfr_jax.runtime.reading import irregular
+from cfr_jax.runtime.words import Refused, shown
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,10 @@ def recognize(path: str | Path, kind: str | None = None) -> Layout:
 
 
 def _existing(path: Path) -> Path:
-    if not path.exists():
-        raise ValueError(f"there is no file or folder {path}")
+    if not os.path.exists(path):
+        raise Refused(f"there is no file or folder {shown(path)}")
+    if (what := irregular(path)) is not None:
+        raise Refused(f"{shown(path)} is {what}, wanted a file or a folder")
     return path
 
 

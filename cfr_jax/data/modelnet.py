@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from cfr_jax.data.corpus import Corpus, read_corpus
+from cfr_jax.runtime.reading import text
+from cfr_jax.runtime.words import Refused, shown
 
 Split = Literal["train", "val", "test"]
 
+_LARGEST_LIST = 1 << 20  # bytes
 SEEN = 20  # of the 40 categories are seen in training; the others appear only in the test
 WHERE = (
     "Download modelnet40_ply_hdf5_2048.zip (415 MB; "
@@ -47,7 +50,11 @@ def _listed(folder: Path, half: str) -> list[Path]:
         if not (folder / needed).is_file():
             raise ValueError(f"{folder} has no {needed}. {WHERE}")
     listed = folder / f"{half}_files.txt"
-    files = [folder / Path(line).name for line in listed.read_text().split()]
+    try:
+        lines = text(listed, _LARGEST_LIST).split()
+    except Refused as error:
+        raise Refused(f"{shown(listed)} {error}. {WHERE}") from error
+    files = [folder / Path(line).name for line in lines]
     missing = [file.name for file in files if not file.is_file()]
     if missing or not files:
         raise ValueError(f"{folder} lacks {missing or 'all files'} of {listed.name}. {WHERE}")

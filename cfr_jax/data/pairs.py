@@ -13,16 +13,25 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterable, Sequence
+import io
+import os
+from array import array
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
-import h5py
 import numpy as np
 from jaxtyping import Float
 
-from cfr_jax.geometry.motions import check_rigid
+from cfr_jax.data.hdf5 import reading as hdf5
+from cfr_jax.geometry.motions import are_rigid, check_rigid
+from cfr_jax.runtime.reading import opened
+from cfr_jax.runtime.sequences import OnDemand, Texts
+from cfr_jax.runtime.words import Refused, shown
+
+_OF_A_PAIR = ("source", "target", "source_normals", "target_normals", "transform", "overlap")
+_BLOCK = 4096  # motions that are checked at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +64,24 @@ def among(chosen: tuple[int, int] | None, frames: Iterable[int | str]) -> bool:
     )
 
 
-class _OneByOne(Sequence[Pair]):
-    """Pairs that are read or made each time they are accessed."""
+class PairsOnDemand(OnDemand[Pair]):
+    """`count` pairs, where pair i is `make(i)`, made each time it is accessed."""
+
+
+class PairFile(Sequence[Pair]):
+    """The pairs of a file, in its order."""
+
+    path: Path
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        if not os.path.exists(self.path):
+            raise Refused(f"path: there is no file of pairs at {shown(path)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What each pair is called; reads no cloud."""
+        raise NotImplementedError
 
     @overload
     def __getitem__(self, index: int) -> Pair: ...
@@ -66,7 +91,7 @@ class _OneByOne(Sequence[Pair]):
 
     def __getitem__(self, index: int | slice) -> Pair | list[Pair]:
         if isinstance(index, slice):
-            return [self._read(row) for row in range(len(self))[index]]
+            return [self[row] for row in range(len(self))[index]]
         if not -len(self) <= index < len(self):
             raise IndexError(f"index: got {index}, wanted one of {len(self)} pairs")
         return self._read(range(len(self))[index])
@@ -75,74 +100,103 @@ class _OneByOne(Sequence[Pair]):
         raise NotImplementedError
 
 
-class PairsOnDemand(_OneByOne):
-    """`count` pairs, where pair i is `make(i)`, made each time it is accessed."""
-
-    def __init__(self, count: int, make: Callable[[int], Pair]):
-        self._count, self._make = count, make
-
-    def __len__(self) -> int:
-        return self._count
-
-    def _read(self, index: int) -> Pair:
-        return self._make(index)
-
-
-class PairFile(_OneByOne):
-    """The pairs of a file, in its order. `names` is available without reading any cloud."""
-
-    path: Path
-    names: tuple[str, ...]
-
-    def __init__(self, path: str | Path):
-        self.path = Path(path)
-        if not self.path.is_file():
-            raise ValueError(f"path: there is no file of pairs at {path}")
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-
 class CsvPairs(PairFile):
-    """A list of pairs. The list is checked when it is opened, and each cloud when it is read."""
+    """A list of pairs. The list is checked when it is opened, and each cloud when it is read.
+
+    A list of a million pairs takes little memory: names are kept as bytes, one after the other.
+    """
 
     def __init__(self, path: str | Path):
         super().__init__(path)
-        self._rows: list[tuple[str, str, np.ndarray | None]] = []
+        self._sources, self._targets = Texts(), Texts()
+        self._truths = _Truths(shown(path))
         try:
-            with open(self.path, newline="", encoding="utf-8-sig") as file:
-                reader = csv.reader(file)
-                for cells in reader:
-                    row = _parse_row([cell.strip() for cell in cells], self.path, reader.line_num)
-                    if row:
-                        self._rows.append(row)
+            with (
+                opened(self.path) as stream,
+                io.TextIOWrapper(stream, "utf-8-sig", newline="") as text,
+            ):
+                self._read_rows(csv.reader(text))
         except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{self.path} is not a CSV list ({error})") from error
-        if not self._rows:
-            raise ValueError(f"{self.path} lists no pairs; wanted lines of `source,target`")
-        self.names: tuple[str, ...] = tuple(
-            f"{source} -> {target}" for source, target, _ in self._rows
-        )
+            raise Refused(f"{shown(path)} is not a CSV list ({error})") from error
+        except Refused as error:
+            told = str(error)
+            if told == "is empty":
+                told = "lists no pairs; wanted lines of `source,target`"
+            raise (error if shown(path) in told else Refused(f"{shown(path)} {told}")) from None
+        if not self._sources:
+            raise Refused(f"{shown(path)} lists no pairs; wanted lines of `source,target`")
+
+    def _read_rows(self, reader: Any) -> None:
+        path = shown(self.path)
+        for cells in reader:
+            row = _parse_row([cell.strip() for cell in cells], path, reader.line_num)
+            if row is not None:
+                source, target, numbers = row
+                self._sources.append(source)
+                self._targets.append(target)
+                self._truths.append(numbers, reader.line_num)
+        self._truths.check()
+
+    def __len__(self) -> int:
+        return len(self._sources)
 
     @property
-    def listed(self) -> list[tuple[str, str]]:
+    def names(self) -> tuple[str, ...]:
+        """Source and target of each pair, with an arrow between them."""
+        return tuple(" -> ".join(pair) for pair in self.listed)
+
+    @property
+    def listed(self) -> Sequence[tuple[str, str]]:
         """Source and target of each pair, as written in the list."""
-        return [(source, target) for source, target, _ in self._rows]
+        return OnDemand(len(self), lambda row: (self._sources[row], self._targets[row]))
 
     def _read(self, index: int) -> Pair:
         from cfr_jax.io import read  # imported here: a list alone does not need the readers
 
-        source_file, target_file, transform = self._rows[index]
+        source_file, target_file = self.listed[index]
         source = read(self.path.parent / source_file)
         target = read(self.path.parent / target_file)
         return Pair(
-            name=self.names[index],
+            name=f"{source_file} -> {target_file}",
             source=source.points,
             target=target.points,
             source_normals=source.normals,
             target_normals=target.normals,
-            transform=transform,
+            transform=self._truths[index],
         )
+
+
+class _Truths:
+    """The true motion of each line of a list, if it has one, checked many at a time."""
+
+    def __init__(self, path: str):
+        self._path = path
+        self._rows, self._lines, self._numbers = array("q"), array("q"), array("d")
+        self._checked = 0
+
+    def append(self, numbers: list[float] | None, line: int) -> None:
+        """Adds the numbers of a line, or None."""
+        self._rows.append(-1 if numbers is None else len(self._lines))
+        if numbers is not None:
+            self._lines.append(line)
+            self._numbers.extend(numbers)
+            if len(self._lines) - self._checked >= _BLOCK:
+                self.check()
+
+    def check(self) -> None:
+        """Raises ValueError, naming the line, if one that was not checked yet is no motion."""
+        start, self._checked = self._checked, len(self._lines)
+        held = np.array(self._numbers[16 * start :]).reshape(-1, 4, 4)
+        if are_rigid(held).all():
+            return
+        for line, motion in zip(self._lines[start:], held, strict=True):
+            check_rigid(f"{self._path}, line {line}: transform", motion)
+
+    def __getitem__(self, index: int) -> Float[np.ndarray, "4 4"] | None:
+        place = self._rows[index]
+        if place < 0:
+            return None
+        return np.array(self._numbers[16 * place : 16 * place + 16]).reshape(4, 4)
 
 
 class Hdf5Pairs(PairFile):
@@ -150,15 +204,17 @@ class Hdf5Pairs(PairFile):
 
     def __init__(self, path: str | Path):
         super().__init__(path)
-        try:
-            with h5py.File(self.path, "r") as file:
-                self.names: tuple[str, ...] = tuple(
-                    sorted(k for k, v in file.items() if isinstance(v, h5py.Group))
-                )
-        except OSError as error:
-            raise ValueError(f"{self.path} is not an HDF5 file ({error})") from error
-        if not self.names:
-            raise ValueError(f"{self.path} has no groups; wanted one per pair: source, target, ...")
+        self._names = tuple(sorted(hdf5.read(self.path, groups=True).groups))
+        if not self._names:
+            raise Refused(f"{shown(path)} has no groups; wanted one per pair: source, target, ...")
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the groups."""
+        return self._names
 
     def frames(self, index: int) -> tuple[str | int, str | int]:
         """Frames that the source and the target of a pair were recorded from.
@@ -167,26 +223,28 @@ class Hdf5Pairs(PairFile):
         to the pair if it lacks them.
         """
         name = self.names[index]
-        with h5py.File(self.path, "r") as file:
-            said = file[name].attrs
-            if "source_frame" in said and "target_frame" in said:
-                return int(said["source_frame"]), int(said["target_frame"])
+        frames = [("", "source_frame"), ("", "target_frame")]
+        said = hdf5.read(self.path, group=name, attributes=frames).attributes
+        if len(said) == 2:
+            return int(said["@source_frame"]), int(said["@target_frame"])
         return f"{name}/source", f"{name}/target"
 
     def _read(self, index: int) -> Pair:
         name = self.names[index]
-        where = f"{self.path}, {name}"
-        with h5py.File(self.path, "r") as file:
-            held = {key: np.asarray(value) for key, value in file[name].items()}
+        where = f"{shown(self.path)}, {shown(name)}"
+        found = hdf5.read(self.path, group=name, arrays=_OF_A_PAIR)
+        held = found.arrays
         missing = [key for key in ("source", "target") if key not in held]
         if missing:
-            raise ValueError(f"{where} lacks {missing}, and holds only {sorted(held)}")
+            raise Refused(f"{where} lacks {missing}, and holds only {sorted(found.names)}")
         for key in ("source", "target", "source_normals", "target_normals"):
             if key in held:
                 held[key] = _checked_rows(
                     held[key], like=held[key.split("_")[0]], where=where, key=key
                 )
-        truth = held.get("transform")
+        truth, overlap = held.get("transform"), held.get("overlap")
+        if overlap is not None and (overlap.size != 1 or not np.isfinite(overlap).all()):
+            raise Refused(f"{where}: overlap has the shape {overlap.shape}, wanted one number")
         return Pair(
             name=name,
             source=held["source"],
@@ -194,7 +252,7 @@ class Hdf5Pairs(PairFile):
             source_normals=held.get("source_normals"),
             target_normals=held.get("target_normals"),
             transform=None if truth is None else check_rigid(f"{where}: transform", truth),
-            overlap=float(held["overlap"]) if "overlap" in held else None,
+            overlap=None if overlap is None else float(overlap.reshape(())),
         )
 
 
@@ -207,27 +265,26 @@ def with_truth(held: PairFile, index: int) -> Pair:
 
 
 def _parse_row(
-    cells: list[str], path: Path, line: int
-) -> tuple[str, str, Float[np.ndarray, "4 4"] | None] | None:
-    """Source, target and true motion of a line, or None if the line is not a pair."""
+    cells: list[str], path: str, line: int
+) -> tuple[str, str, list[float] | None] | None:
+    """Source, target and the numbers of a line, or None if the line is not a pair."""
     header = line == 1 and [cell.lower() for cell in cells[:2]] == ["source", "target"]
     if header or not any(cells) or cells[0].startswith("#"):
         return None
     source, target, *numbers = [*cells, ""][:2] + cells[2:]
     where = f"{path}, line {line}"
     if not source or not target:
-        raise ValueError(f"{where}: wanted `source,target`, got {','.join(cells)!r}")
+        raise Refused(f"{where}: wanted `source,target`, got {shown(repr(','.join(cells)))}")
     if not any(numbers):
         return source, target, None
     try:
-        values = np.array([float(number) for number in numbers])
+        values = [float(number) for number in numbers]
     except ValueError as error:
-        raise ValueError(f"{where}: {error}; wanted 16 numbers after the two files") from error
+        told = shown(error)
+        raise Refused(f"{where}: {told}; wanted 16 numbers after the two files") from error
     if len(values) != 16:
-        raise ValueError(
-            f"{where}: got {len(values)} numbers after the two files, wanted 16 or none"
-        )
-    return source, target, check_rigid(f"{where}: transform", values.reshape(4, 4))
+        raise Refused(f"{where}: got {len(values)} numbers after the two files, wanted 16 or none")
+    return source, target, values
 
 
 def _checked_rows(

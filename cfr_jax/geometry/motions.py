@@ -81,11 +81,15 @@ def are_rigid(transforms: Float[np.ndarray, "*batch 4 4"]) -> Bool[np.ndarray, "
     """Which matrices are finite, with a rotation that is proper up to `TOLERANCE` and a last row
     0 0 0 1."""
     finite = np.isfinite(transforms).all(axis=(-2, -1))
+    # the entries of a rotation are at most 1, and the squares of large ones overflow
+    small = (np.abs(np.nan_to_num(transforms[..., :3, :3])) < 2).all(axis=(-2, -1))
+    finite = finite & small
     sound = np.where(finite[..., None, None], transforms, 0)
     turns = sound[..., :3, :3]
     off = np.abs(turns @ turns.swapaxes(-1, -2) - np.eye(3)).max(axis=(-2, -1))
     last = np.abs(sound[..., 3, :] - (0, 0, 0, 1)).max(axis=-1)
-    proper = np.linalg.det(turns) > 0
+    with np.errstate(all="ignore"):  # of entries near the smallest float
+        proper = np.linalg.det(turns) > 0
     return np.asarray(finite & (off <= TOLERANCE) & proper & (last <= _LAST_ROW))
 
 
@@ -114,7 +118,7 @@ def check_rigid(
 def _fault(transform: Float[np.ndarray, "4 4"]) -> str:
     if not np.isfinite(transform).all():
         return "not all numbers are finite"
-    turn = transform[:3, :3]
+    turn = np.clip(transform[:3, :3], -1e9, 1e9)  # whose squares are numbers
     off = np.abs(turn @ turn.T - np.eye(3)).max()
     if off > TOLERANCE:
         return f"R Rᵀ differs from the identity by {off:.2g}"

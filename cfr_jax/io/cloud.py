@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64, Real
 
+from cfr_jax.runtime.words import Refused
+
 if TYPE_CHECKING:
     from cfr_jax.io.table import Table
 
@@ -19,7 +21,7 @@ LARGEST_COORDINATE = 1e12
 UNIT_TOLERANCE = 0.02
 
 
-class CloudFileError(ValueError):
+class CloudFileError(Refused):
     """A file could not be read or written; says which file, where in it, and what was wanted."""
 
 

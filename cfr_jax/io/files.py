@@ -1,13 +1,11 @@
 """`read` and `write`: from a path to a cloud and back.
 
-The formats come from the table `cfr_jax.io.formats`. `contents` is the one place where a file that
-a user names is opened.
+The formats come from the table `cfr_jax.io.formats`. Files are opened by `runtime.reading`.
 """
 
 from __future__ import annotations
 
 import os
-import stat
 import warnings
 from collections.abc import Iterable
 from dataclasses import replace
@@ -19,7 +17,9 @@ from cfr_jax.io.formats import Format
 from cfr_jax.io.mesh import Mesh
 from cfr_jax.io.naming import checked_columns
 from cfr_jax.io.table import table_of_mesh
+from cfr_jax.runtime import reading
 from cfr_jax.runtime.atomic import unfinished
+from cfr_jax.runtime.words import Refused, shown
 
 
 def read(
@@ -66,7 +66,7 @@ def read(
     try:
         cloud = shape.points(samples, seed) if isinstance(shape, Mesh) else shape
     except ValueError as error:
-        raise CloudFileError(f"{path}: {error}") from None
+        raise CloudFileError(f"{shown(path)}: {error}") from None
     for note in cloud.notes:
         warnings.warn(CloudWarning(path, note), stacklevel=2)
     return cloud
@@ -86,7 +86,7 @@ def read_shape(
     """
     path = Path(path)
     try:
-        if path.is_dir():
+        if os.path.isdir(path):
             raise CloudFileError("is a folder, wanted a file")
         form = _chosen(known, path.suffix)
         if columns is not None and not form.has_columns:
@@ -95,7 +95,7 @@ def read_shape(
         options = {"columns": columns, "whole": whole} if form.has_columns else {}
         return form.parse(contents(path), path.name, *place, **options)
     except ValueError as error:
-        raise CloudFileError(f"{path}: {error}") from None
+        raise CloudFileError(f"{shown(path)}: {error}") from None
 
 
 def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
@@ -118,9 +118,9 @@ def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:
         with unfinished(path) as beside, open(beside, "xb") as stream:
             notes = save(stream, cloud)
     except OSError as error:
-        raise CloudFileError(f"{path}: cannot be written: {error.strerror}") from None
+        raise CloudFileError(f"{shown(path)}: cannot be written: {error.strerror}") from None
     except ValueError as error:
-        raise CloudFileError(f"{path}: {error}") from None
+        raise CloudFileError(f"{shown(path)}: {error}") from None
     for note in notes or ():
         warnings.warn(CloudWarning(path, note), stacklevel=2)
 
@@ -129,15 +129,9 @@ def contents(path: Path) -> bytes:
     """All bytes of a file that a user names; raises CloudFileError, without the path, where there
     are none or where reading might never end."""
     try:
-        mode = path.stat().st_mode
-        if not stat.S_ISREG(mode):  # reading a pipe or a device may never end
-            raise CloudFileError("is not a regular file")
-        data = path.read_bytes()
-    except OSError as error:
-        raise CloudFileError(f"cannot be read: {error.strerror}") from None
-    if not data:
-        raise CloudFileError("is empty")
-    return data
+        return reading.contents(path)
+    except Refused as error:
+        raise CloudFileError(error) from None
 
 
 def _chosen(known: Iterable[Format], suffix: str) -> Format:

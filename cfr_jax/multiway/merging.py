@@ -88,7 +88,7 @@ def merge(
         "batch": batch,
         "workers": workers,
     }
-    start = _start(clouds, options, sequence, guesses, kept or Memory(), progress)
+    start = _start(clouds, options, sequence, guesses, Memory() if kept is None else kept, progress)
     usable, registrar, tries = start.scans, start.registrar, start.tries
     seconds = {"read": time.perf_counter() - began}
 

@@ -26,21 +26,20 @@ rotations. It tells the records of two scans apart."""
 class Kept(Protocol):
     """Where records are kept: `batch.journal.Journal` is one."""
 
-    done: dict[tuple[str, str, int], Record]
+    def __contains__(self, key: tuple[str, str, int]) -> bool: ...
+
+    def __getitem__(self, key: tuple[str, str, int]) -> Record: ...
 
     def write(self, record: Record) -> None:
         """Keeps a record."""
 
 
-class Memory:
+class Memory(dict[tuple[str, str, int], Record]):
     """Records that are kept as long as the program runs."""
 
-    def __init__(self) -> None:
-        self.done: dict[tuple[str, str, int], Record] = {}
-
     def write(self, record: Record) -> None:
         """Keeps a record."""
-        self.done[record["source"], record["target"], record["repeat"]] = record
+        self[record["source"], record["target"], record["repeat"]] = record
 
 
 class Registrar:
@@ -69,7 +68,7 @@ class Registrar:
                     record = as_record(jobs[row], outcome)
                     self._kept.write(record | {"digests": self._digests(tries[row])})
                     bar.update()
-        return [self._kept.done[job.key] for job in jobs]
+        return [self._kept[job.key] for job in jobs]
 
     def _outcomes(self, tries: list[Try], kind: int) -> Any:
         if kind != ANYWHERE:
@@ -98,7 +97,7 @@ class Registrar:
 
     def _found(self, job: Job, pair: Try) -> Record | None:
         """The record of a pair that is done, unless one of its files has changed since."""
-        record = self._kept.done.get(job.key)
+        record = self._kept[job.key] if job.key in self._kept else None
         return record if record and record.get("digests") == self._digests(pair) else None
 
 

@@ -7,9 +7,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import stat
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
+
+from cfr_jax.runtime.reading import contents, opened, parse_json
+from cfr_jax.runtime.words import Refused
 
 NAME = "manifest.json"
+Read = TypeVar("Read")
 
 
 class Damaged(ValueError):
@@ -23,14 +31,12 @@ def write(folder: Path) -> None:
 
 def verify(folder: Path) -> None:
     """Raises `Damaged` unless `folder` holds exactly what its manifest says."""
+    if not os.path.lexists(folder / NAME):
+        raise Damaged(f"{folder} has no {NAME}: it was never finished")
+    told = _checked(folder / NAME, contents)
+    found = _files(folder)
     try:
-        told, found = (folder / NAME).read_bytes(), _files(folder)
-    except FileNotFoundError as error:
-        raise Damaged(f"{folder} has no {NAME}: it was never finished") from error
-    except OSError as error:  # a disk that cannot read its own sectors
-        raise Damaged(f"{error.filename} cannot be read ({error.strerror})") from error
-    try:
-        wanted = json.loads(told)["files"]
+        wanted = parse_json(told)["files"]
     except (ValueError, KeyError, TypeError) as error:
         raise Damaged(f"{folder / NAME} cannot be read") from error
     # Compared byte by byte: a flipped bit may leave valid JSON, and that is damage, too.
@@ -46,12 +52,29 @@ def verify(folder: Path) -> None:
 
 
 def _files(folder: Path) -> dict[str, str]:
-    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != NAME)
-    return {path.relative_to(folder).as_posix(): _digest(path) for path in paths}
+    """The digest of each file. Whatever is no file, such as a pipe, raises `Damaged`."""
+    paths = sorted(path for path in folder.rglob("*") if path.name != NAME and not _is_folder(path))
+    return {path.relative_to(folder).as_posix(): _checked(path, _digest) for path in paths}
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
+
+
+def _checked(path: Path, read: Callable[[Path], Read]) -> Read:
+    try:
+        return read(path)
+    except Refused as error:
+        raise Damaged(f"{path} {error}") from error
+    except OSError as error:  # a disk that cannot read its own sectors
+        raise Damaged(f"{path} cannot be read ({error.strerror})") from error
 
 
 def _digest(path: Path) -> str:
-    with path.open("rb") as file:
+    about = path.lstat()
+    if stat.S_ISREG(about.st_mode) and not about.st_size:  # orbax writes empty files, too
+        return hashlib.sha256().hexdigest()
+    with opened(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

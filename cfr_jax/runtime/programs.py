@@ -24,8 +24,9 @@ import jaxlib
 from jax import export as jax_export
 
 from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.runtime.private import make_private
+from cfr_jax.runtime.seals import sealed, unsealed
 
-_SHA256 = 32  # bytes, in front of each file
 _UNUSED = 30 * 24 * 3600.0  # seconds without use after which a program is deleted
 _places: list[Path] = []  # the folder that programs are kept in; empty means none
 
@@ -33,9 +34,15 @@ _places: list[Path] = []  # the folder that programs are kept in; empty means no
 def keep_in(folder: Path) -> None:
     """From now on, keeps lowered programs in `folder` until they have not been used for a month.
 
-    If the folder cannot be written, programs are traced again in each process, without an error.
+    Only this user may enter a folder that is made. If the folder cannot be written, programs are
+    traced again in each process, without an error. Raises ValueError if the folder belongs to
+    another user or others may write into it: the programs in it are run and their answers believed.
     """
-    _places[:] = [folder / _versions()]
+    place = folder / _versions()
+    for each in (folder, place):
+        with contextlib.suppress(OSError):
+            make_private(each)
+    _places[:] = [place]
 
 
 def storable(*nodes: type) -> None:
@@ -99,24 +106,24 @@ def _read(path: Path) -> jax_export.Exported | None:
         content = path.read_bytes()
     except OSError:
         return None
-    told, content = content[:_SHA256], content[_SHA256:]
-    if told != hashlib.sha256(content).digest():
+    program = unsealed(content)
+    if program is None:
         return None
     with contextlib.suppress(OSError):
         os.utime(path)  # marks it as used today
-    return jax_export.deserialize(bytearray(content))
+    return jax_export.deserialize(bytearray(program))
 
 
 def _keep(path: Path, exported: jax_export.Exported) -> None:
     """Writes the program to `path`, unless the disk refuses or a type in it is not `storable`."""
     try:
-        content = exported.serialize()
+        content = bytes(exported.serialize())
     except ValueError:
         return
     with contextlib.suppress(OSError):
         _throw_away_unused(path.parent.parent)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, hashlib.sha256(content).digest() + content)
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        write_atomically(path, sealed(content))
 
 
 def _throw_away_unused(folder: Path) -> None:

@@ -20,7 +20,7 @@ from cfr_jax.weights.files import read_weights
 
 _NAMED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 WEIGHTS = "weights.safetensors"  # the best so far
-_KEPT = ("step", "steps", "best", "validation", "position", "clock", "skipped")
+_KEPT = ("step", "steps", "best", "validation", "position", "clock", "skipped", "pending")
 
 
 def begin(config: TrainingConfig, stamps: dict[str, str]) -> dict[str, Any]:
@@ -37,6 +37,7 @@ def begin(config: TrainingConfig, stamps: dict[str, str]) -> dict[str, Any]:
         "random_key": np.asarray(jax.random.key_data(jax.random.key(config.seed))).tolist(),
         "skipped": 0,
         "clock": {"seconds": 0.0, "processor_seconds": 0.0},
+        "pending": {},  # measurements of the last steps that no line tells of yet
         "config": json.loads(json.dumps(dataclasses.asdict(config))),
         "data": stamps,
         "versions": versions,

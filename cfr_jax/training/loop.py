@@ -212,7 +212,11 @@ class _Training:
         return Leg(phase, task.samplings[task.phases.index(phase)], recipe)
 
     def _take_note(self) -> None:
-        self.about |= {"clock": self.reports.clock.read(), "skipped": int(self.state.skipped)}
+        self.about |= {
+            "clock": self.reports.clock.read(),
+            "skipped": int(self.state.skipped),
+            "pending": self.reports.pending(),
+        }
 
 
 def _stop_if_diverged(in_row: int, done: int, most: int) -> None:

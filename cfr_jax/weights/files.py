@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,15 @@ from typing import Any
 import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
+from safetensors.numpy import load, save
 
 from cfr_jax.networks import table
 from cfr_jax.networks.clues import NetworkClues
 from cfr_jax.networks.probability import KEY, Calibration, calibration_of, uncalibrated
 from cfr_jax.networks.record import Network, Params
 from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.runtime.reading import contents, parse_json
+from cfr_jax.runtime.words import Refused, shown
 
 SHIPPED = Path(__file__).parent / "shipped"
 DEFAULT = "object"
@@ -90,41 +92,45 @@ def read_weights(source: str | Path = DEFAULT, network: str | None = None) -> We
     """Reads weights with their network, name, digest and notes.
 
     Raises `NoWeights` if there is no such name or file. Raises ValueError if the file is damaged
-    (its digest does not match, or its calibration is malformed) or holds a different network than
-    `network` (None: any).
+    (its digest does not match, or its calibration is malformed), if a number in it is not finite,
+    or if it holds a different network than `network` (None: any).
     """
     path = Path(source)
     if str(source) in shipped():
         path = SHIPPED / f"{source}.safetensors"
-    if not path.is_file():
+    if not os.path.exists(path):
         raise NoWeights(
-            f"weights: there is no file and no shipped weights called {str(source)!r}; "
+            f"weights: there is no file and no shipped weights called {shown(source)!r}; "
             f"shipped are {', '.join(shipped()) or 'none'}"
         )
+    where = f"weights: {shown(path)}"
     try:
-        with safe_open(path, framework="numpy") as file:
-            notes = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, OSError, ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"weights: {path} is not a readable safetensors file ({error})") from error
+        data = contents(path)
+        # not by its name: what is read is what was opened
+        tensors, notes = load(data), _metadata(data)
+    except Exception as error:  # also of a type of numbers that numpy does not have
+        raise Refused(f"{where} is not a readable safetensors file ({error})") from error
     told = notes.pop("sha256", None)
     if told is None:
-        raise ValueError(
-            f"weights: {path} has no digest, so cfr_jax did not write it; "
+        raise Refused(
+            f"{where} has no digest, so cfr_jax did not write it; "
             "convert the authors' own tensors with `cfr convert` first"
         )
     if told != _digest(tensors, notes):
-        raise ValueError(f"weights: {path} is damaged: its digest does not match its content")
+        raise Refused(f"{where} is damaged: its digest does not match its content")
     try:
         record = table.recognize(tensors)
         calibration = _calibration(notes.pop(KEY, None))
+        if path.parent != SHIPPED:  # tests check those, because tracing a network takes a second
+            _check_shapes(tensors, record)
+        for name, value in tensors.items():
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name} holds a number that is not finite")
     except ValueError as error:
-        raise ValueError(f"weights: {path}: {error}") from error
-    if path.parent != SHIPPED:  # tests check those, because tracing a network takes a second
-        _check_shapes(path, tensors, record)
+        raise Refused(f"{where}: {error}") from error
     if network not in (None, record.name):
         wanted = table.network(network).title
-        raise ValueError(f"weights: {path} holds the network {record.title}, wanted {wanted}")
+        raise Refused(f"{where} holds the network {record.title}, wanted {wanted}")
     # not jnp.asarray, which compiles a copy for each shape
     params = jax.device_put(unflatten_dict(tensors, sep="/"))
     if calibration is not None:
@@ -145,19 +151,32 @@ def _flat(params: Mapping[str, Any]) -> dict[str, Any]:
     return flatten_dict(uncalibrated(params), sep="/")
 
 
-def _check_shapes(path: Path, tensors: dict[str, np.ndarray], record: Network) -> None:
+def _check_shapes(tensors: dict[str, np.ndarray], record: Network) -> None:
     found = {name: leaf.shape for name, leaf in tensors.items()}
-    fresh = functools.partial(record.fresh, **record.arguments(found))
-    wanted = jax.eval_shape(fresh, jax.random.key(0))
-    wanted = {name: leaf.shape for name, leaf in flatten_dict(wanted, sep="/").items()}
+    # `arguments` refuses more iterations than can be traced
+    wanted = _fresh_shapes(record, tuple(record.arguments(found).items()))
     for name in sorted(wanted.keys() | found.keys()):
         if wanted.get(name) != found.get(name):
             raise ValueError(
-                f"weights: {path} does not hold {record.title}: {name} is "
+                f"it does not hold {record.title}: {shown(name)} is "
                 f"{found.get(name, 'missing')}, wanted {wanted.get(name, 'no such tensor')}"
             )
         if tensors[name].dtype != np.float32:
-            raise ValueError(f"weights: {path}: {name} is {tensors[name].dtype}, wanted float32")
+            raise ValueError(f"{name} is {tensors[name].dtype}, wanted float32")
+
+
+@functools.lru_cache(maxsize=16)
+def _fresh_shapes(
+    record: Network, arguments: tuple[tuple[str, Any], ...]
+) -> Mapping[str, tuple[int, ...]]:
+    fresh = jax.eval_shape(functools.partial(record.fresh, **dict(arguments)), jax.random.key(0))
+    return {name: leaf.shape for name, leaf in flatten_dict(fresh, sep="/").items()}
+
+
+def _metadata(data: bytes) -> dict[str, str]:
+    """The notes in the header of a safetensors file that the library has read."""
+    length = int.from_bytes(data[:8], "little")
+    return parse_json(data[8 : 8 + length]).get("__metadata__") or {}
 
 
 def _digest(tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any]) -> str:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +24,9 @@ from cfr_jax.networks.cfr.registration import register
 from cfr_jax.networks.inputs import Settings, prepare
 from cfr_jax.networks.record import Params
 from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.runtime.reading import contents
+from cfr_jax.runtime.seals import sealed, unsealed
+from cfr_jax.runtime.words import Refused, shown
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 OUTPUTS = ("transform", "transforms", "weights", "covered")
@@ -87,8 +89,13 @@ def export_register(
 
 
 def save_exported(path: str | os.PathLike[str], exported: jax_export.Exported) -> None:
-    """Writes the program to a temporary file, then renames it to `path`."""
-    write_atomically(path, bytes(exported.serialize()))
+    """Writes the program to a temporary file, then renames it to `path`.
+
+    The file holds 32 bytes, the SHA-256 of the rest, and then what `exported.serialize()` returns.
+    JAX itself does not notice most flipped bits of a program. A host without this package checks
+    the digest in two lines (`examples/run_exported.py`).
+    """
+    write_atomically(path, sealed(bytes(exported.serialize())))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,15 +154,25 @@ class ExportedRegister:
 
 
 def load_exported(path: str | os.PathLike[str]) -> ExportedRegister:
-    """Reads a program that `save_exported` or `cfr export` wrote.
+    """Reads a program that `save_exported` or `cfr export` wrote, after checking its digest.
 
-    Raises ValueError for any other file.
+    Raises ValueError for any other file, and if a bit of it has changed. A program without a digest
+    in front, as `jax.export` alone writes it, is refused, too: what it computes cannot be checked.
+    `jax.export.deserialize` loads it.
     """
-    content = bytearray(Path(path).read_bytes())
     try:
-        exported = jax_export.deserialize(content)
-    except Exception as error:  # flatbuffers may read past the end or find nonsense
-        raise ValueError(f"{path} is not an exported program: {type(error).__name__}") from error
-    if len(exported.in_avals) != 4:
-        raise ValueError(f"{path} is an exported program, but not one of `register`")
+        content = unsealed(contents(path))
+        if content is None:
+            raise Refused(
+                "is not an exported program, or it is damaged: its first 32 bytes are not the "
+                "SHA-256 of the rest"
+            )
+        try:
+            exported = jax_export.deserialize(bytearray(content))
+        except Exception as error:  # flatbuffers may read past the end or find nonsense
+            raise Refused(f"is not an exported program: {type(error).__name__}") from error
+        if [aval.ndim for aval in exported.in_avals] not in ([2, 0, 2, 0], [3, 1, 3, 1]):
+            raise Refused("is an exported program, but not one of `register`")
+    except Refused as error:
+        raise Refused(f"{shown(path)} {error}") from error
     return ExportedRegister(exported)

@@ -60,6 +60,13 @@ def test_a_bad_cloud_is_refused_by_name(name, bad, told):
         np.eye(4) + np.eye(4)[[3, 0, 1, 2]],
         solids.motion(0, translation=(1e6, 0, 0)),
         solids.motion(0, translation=(1e300, 0, 0)),
+        1e200 * np.eye(4),
+        np.eye(4) + 0j,
+        [[10**400, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+        np.eye(4).astype(str),
+        np.full((4, 4), 10**400, object),
+        np.zeros((4, 4), "M8[s]"),
+        [[]] * 4,
     ],
 )
 def test_a_bad_initial_motion_is_refused_by_name(unchecked, initial):
@@ -71,7 +78,8 @@ def test_a_bad_initial_motion_is_refused_by_name(unchecked, initial):
     "argument",
     [{"max_points": bad} for bad in (2, 0, -1, 10.5, True, "10")]
     + [{"seed": bad} for bad in (-1, 0.5, None, "0")]
-    + [{"params": "weights.safetensors"}],
+    + [{"params": bad} for bad in ("weights.safetensors", {}, {1: 2}, {"cascade": 3}, 7, [])]
+    + [{"params": {"cascade": {"kernel": np.zeros(3, np.float32)}}}],
 )
 def test_other_bad_arguments_are_refused_by_name(unchecked, argument):
     [name] = argument

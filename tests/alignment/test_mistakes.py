@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 
 import h5py
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 from cfr_jax import io
+from cfr_jax.batch.journal import FORMAT, line_of
 from cfr_jax.cli import main
 from cfr_jax.cli.shared import outputs
 
@@ -131,8 +131,8 @@ def place(tmp_path, monkeypatch):
     }
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
-    begun = {"format": "cfr_jax/batch/1", "made_with": {"weights": "0" * 64}}
-    (tmp_path / "begun.jsonl").write_text(json.dumps(begun) + "\n")
+    begun = {"format": FORMAT, "made_with": {"weights": "0" * 64}}
+    (tmp_path / "begun.jsonl").write_bytes(line_of(begun))
     for name in ("empty.ply", "photo.jpg", "photos/1.jpg"):
         (tmp_path / name).touch()
     (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8\xff")

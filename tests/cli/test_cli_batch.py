@@ -16,6 +16,7 @@ import jsonschema
 import pytest
 
 from cfr_jax.batch import records, stream
+from cfr_jax.batch.jobs import Job
 from cfr_jax.cli import main
 
 TESTS = Path(__file__).parents[1]
@@ -85,6 +86,30 @@ def test_every_line_of_the_journal_is_as_the_schema_says(tmp_path):
     for wrong in ({"confidence": 2.0}, {"transform": [[1.0]]}, {"error": 3}):
         with pytest.raises(jsonschema.ValidationError):
             validator.validate(found[1] | wrong)
+
+
+@pytest.mark.parametrize("start", ["=", "+", "-", "@", "\t", "\r", "＝"])
+def test_no_cell_of_the_table_is_run_by_a_spreadsheet(start, tmp_path):
+    # given files and messages that begin as formulas do
+    job = Job(f"{start}1+1", f"{start}cmd|' /C calc'!A0.ply", 0, (Path("a"), Path("b")))
+    found = [
+        records.as_record(job, stream.Outcome(0, None, f"{start}HYPERLINK(1)")),
+        records.as_record(job, batch_samples.answered(0)),
+    ]
+
+    # when
+    with open(tmp_path / "t.csv", "w", newline="") as file:
+        records.write_table(file, found)
+
+    # then
+    rows = table(tmp_path / "t.csv")
+    wanted = {"\t": "\\t1+1", "\r": "\\r1+1"}.get(start, f"'{start}1+1")
+    assert [row["source"] for row in rows] == [wanted] * 2
+    for row in rows:
+        for name in ("source", "target", "status", "remarks"):
+            assert not row[name].startswith(start)
+    wanted = batch_samples.answered(0).alignment.transform
+    assert [float(rows[1][f"t{i}3"]) for i in range(4)] == wanted[:, 3].tolist()
 
 
 def test_the_same_command_again_does_nothing_twice(tmp_path, quick, capsys):

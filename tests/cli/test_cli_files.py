@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import stat
 from pathlib import Path
 
@@ -80,7 +81,16 @@ def test_a_transform_is_read_from_every_form(name, tmp_path):
         ("short.txt", b"1 2 3"),
         ("words.txt", b"no numbers here"),
         ("binary.txt", b"\xff\xfe\x80"),
-        ("empty.txt", b""),
+        ("blank.txt", b" "),
+        ("seventeen.txt", b"1 " * 17),
+        ("underscores.txt", b"1_0 " * 16),
+        ("arabic.txt", "١ ".encode() * 16),
+        ("booleans.json", b"[[true, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"),
+        ("texts.json", b'[["1", 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]'),
+        (
+            "huge.json",
+            b"[" + b"[1" + b"0" * 400 + b", 0, 0, 0]," * 3 + b"[0, 0, 0, 1]]",
+        ),
         ("nan.txt", b"nan " * 16),
         ("three.json", b"[[1, 0, 0], [0, 1, 0], [0, 0, 1]]"),
         ("ragged.json", b"[[1, 0], [0]]"),
@@ -96,6 +106,13 @@ def test_a_file_without_a_transform_is_refused_by_name(name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=f"{name}: wanted a 4x4 transform"):
         read_transform(tmp_path / name)
+
+
+@pytest.mark.parametrize("kind", ["complex128", "bool", "U3", "V8", "M8[s]"])
+def test_an_array_of_something_else_than_numbers_is_refused(kind, tmp_path):
+    np.save(tmp_path / "t.npy", np.zeros((4, 4), kind))
+    with pytest.raises(ValueError, match="t.npy: .* wanted floats or integers"):
+        read_transform(tmp_path / "t.npy")
 
 
 def test_a_pickled_array_is_not_unpickled(tmp_path):
@@ -162,3 +179,60 @@ def test_a_cache_that_cannot_be_kept_is_done_without(obstacle, jax_cache, tmp_pa
 
     # then
     assert jax_cache() is None
+
+
+def test_a_cache_is_made_for_its_owner_alone(jax_cache, tmp_path, monkeypatch):
+    monkeypatch.setenv("CFR_JAX_CACHE", str(tmp_path / "deep" / "place"))
+    before = os.umask(0)
+    try:
+        cache.keep_compiled_programs()
+    finally:
+        os.umask(before)
+    made = [tmp_path / "deep" / "place", *(tmp_path / "deep" / "place").iterdir()]
+    assert len(made) == 2
+    assert {stat.S_IMODE(folder.stat().st_mode) for folder in made} == {0o700}
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o720, 0o702, 0o1777])
+def test_a_cache_that_others_may_write_is_refused_in_words(
+    mode, jax_cache, tmp_path, monkeypatch, capsys
+):
+    # given
+    place = tmp_path / "place"
+    place.mkdir()
+    place.chmod(mode)
+    monkeypatch.setenv("CFR_JAX_CACHE", str(place))
+
+    # when
+    cache.keep_compiled_programs()
+
+    # then
+    assert jax_cache() is None and programs._places == []
+    assert "may be written by other users" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="may be written by other users"):
+        programs.keep_in(place)
+
+
+def test_a_cache_of_another_user_is_refused_in_words(jax_cache, tmp_path, monkeypatch, capsys):
+    # given
+    monkeypatch.setenv("CFR_JAX_CACHE", str(tmp_path))
+    tmp_path.chmod(0o755)
+    monkeypatch.setattr(os, "geteuid", lambda: tmp_path.stat().st_uid + 1)
+    if tmp_path.stat().st_uid == 0:  # folders of root are trusted
+        os.chown(tmp_path, 4321, -1)
+        monkeypatch.setattr(os, "geteuid", lambda: 0)
+
+    # when
+    cache.keep_compiled_programs()
+
+    # then
+    assert jax_cache() is None
+    assert "belongs to another user" in capsys.readouterr().err
+
+
+def test_a_folder_of_programs_that_others_may_write_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(programs, "_places", [])
+    programs.keep_in(tmp_path / "cache")
+    programs._places[0].chmod(0o777)
+    with pytest.raises(ValueError, match="programs-.* may be written by other users"):
+        programs.keep_in(tmp_path / "cache")

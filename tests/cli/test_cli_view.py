@@ -133,7 +133,7 @@ def test_what_is_no_result_is_refused(text, told, tmp_path, capsys):
         ("transforms", [[[1, 0], [0, 1]]], "transforms"),
         ("transforms", None, '"transforms"'),
         ("source", {"name": "a"}, '"source" is'),
-        ("confidence", [], "cannot be drawn"),
+        ("confidence", [], '"confidence"'),
         ("inlier_distance", "far", '"inlier_distance"'),
     ],
 )

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import re
 import resource
 import subprocess
 import sys
@@ -21,51 +20,13 @@ from pathlib import Path
 import numpy as np
 from io_samples import write_clouds, write_meshes
 from kind_samples import all_kinds, solids
+from mutants import mutate
 
 CASES = 4000
 SECONDS = 1.0
 BYTES = 64 << 20
 BYTES_PER_BYTE = 4
 _ADDRESS_SPACE = 8 << 30  # ends a runaway allocation before it takes the machine
-
-
-def mutate(data: bytes, generator: random.Random) -> bytes:
-    """One to three damages, more of them in the first bytes, where headers are."""
-    damaged = bytearray(data)
-    for _ in range(generator.choice((1, 1, 1, 2, 3))):
-        size = len(damaged)
-        reach = generator.choice((size, size, min(size, 400)))
-        at = generator.randrange(reach) if reach else 0
-        kind = generator.choice(
-            ("flip", "flip", "cut", "insert", "swap", "repeat", "digit", "digit", "word", "extreme")
-        )
-        if size < 16 or kind == "cut":
-            del damaged[at:]
-        elif kind == "flip":
-            damaged[at] ^= 1 << generator.randrange(8)
-        elif kind == "insert":
-            damaged[at:at] = generator.randbytes(generator.choice((1, 2, 4, 100)))
-        elif kind == "swap":
-            other = generator.randrange(size)
-            damaged[at], damaged[other] = damaged[other], damaged[at]
-        elif kind == "repeat":
-            length = generator.choice((1, 8, 64, 512))
-            damaged[at:at] = damaged[at : at + length] * generator.choice((1, 3))
-        elif kind == "digit":
-            digits = [match.start() for match in re.finditer(rb"[0-9]", damaged)]
-            headers = [digit for digit in digits if digit < 400]
-            if digits:
-                where = generator.choice(headers if headers and at < 400 else digits)
-                damaged[where : where + 1] = generator.choice(
-                    (b"9", b"0", b"-1", b"99999999", b"1e300", b"nan", b"", b"x")
-                )
-        elif kind == "word":
-            length = generator.choice((2, 4, 8))
-            value = generator.choice((0, 1, 2 ** (8 * length - 1), 2 ** (8 * length) - 1))
-            damaged[at : at + length] = value.to_bytes(length, "little")
-        else:  # counts and lengths just beyond what is there
-            damaged[at : at + 4] = (generator.choice((size, 50_000, 1 << 24))).to_bytes(4, "little")
-    return bytes(damaged)
 
 
 def run_cases(cases: int, seed: int) -> dict:

@@ -323,3 +323,27 @@ def test_the_last_transform_of_a_batch_is_the_last_of_each_pair(params, pair):
 
     assert batch.transform.shape == (2, 4, 4)
     close(batch.transform[0], one.transform)
+
+
+@pytest.mark.parametrize("name", ["iterations", "cascades"])
+@pytest.mark.parametrize("count", [1.5, True, "2", np.float64(2), 0, -1])
+def test_a_count_that_is_no_whole_number_is_refused_by_name(params, pair, unchecked, name, count):
+    with pytest.raises(ValueError, match=f"^{name}: got .*, wanted|^{name}: got .* at least 1"):
+        register(params, *both(pair), settings=SMALL, **{name: count})
+
+
+def test_parameters_that_are_none_are_refused_by_name(params, pair, unchecked):
+    wrong = (
+        None,
+        [],
+        {},
+        {"a": 1},
+        {3: params},
+        {**params, "cascade": {}},
+        {**params, "features": "a"},
+    )
+    for given in wrong:
+        with pytest.raises(ValueError, match="^params: got .*, wanted the parameters of load_par"):
+            register(given, *both(pair), settings=SMALL)
+        with pytest.raises(ValueError, match="^params: got .*, wanted the parameters of load_par"):
+            encode(given, both(pair)[1], settings=SMALL)

@@ -1,6 +1,8 @@
 """Lowered programs that are kept between processes give the same results and are never stale."""
 
 import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -156,3 +158,41 @@ def test_a_folder_that_cannot_be_written_costs_only_time(tmp_path, monkeypatch):
 
     assert_right(call())
     programs._program.cache_clear()
+
+
+_RACING = """
+import sys
+from pathlib import Path
+import jax, jax.numpy as jnp, numpy as np
+from cfr_jax.runtime import programs
+from cfr_jax.geometry import rigid
+jax.config.update("jax_compilation_cache_dir", sys.argv[1])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+programs.keep_in(Path(sys.argv[1]))
+motions = jnp.asarray(np.random.default_rng(0).normal(size=(4, 4)), jnp.float32)
+compose = jax.jit(rigid.compose)
+compose.__module__ = rigid.compose.__module__
+print(np.asarray(programs.compiled(compose, motions, motions)(motions, motions)).tobytes().hex())
+"""
+
+
+@pytest.mark.slow
+def test_processes_that_race_on_a_cold_cache_give_the_same_bits(tmp_path):
+    # given
+    paths = os.pathsep.join(filter(None, sys.path))
+    racing = [
+        subprocess.Popen(
+            [sys.executable, "-c", _RACING, str(tmp_path / "cache")],
+            stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths},
+        )
+        for _ in range(4)
+    ]  # fmt: skip
+
+    # when
+    told = [process.communicate(timeout=300)[0] for process in racing]
+
+    # then
+    assert [process.returncode for process in racing] == [0] * 4
+    assert len(set(told)) == 1 and told[0].strip()
+    assert len(list((tmp_path / "cache").glob("programs-*/*.stablehlo"))) == 1
+    assert not list(tmp_path.rglob("*.tmp"))

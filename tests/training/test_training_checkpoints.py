@@ -1,6 +1,7 @@
 """Checkpoints: whole or not there; any damage is found, named, and gone around."""
 
 import json
+import os
 import resource
 import shutil
 import warnings
@@ -254,3 +255,27 @@ def test_a_file_where_the_folder_should_be_is_told(tmp_path):
 
 def test_what_is_said_of_a_state_can_be_read_by_people(folder):
     assert json.loads((folder / "2" / "about.json").read_text()) == {"step": 2}
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "kernel", "dangling link", "link to a folder"])
+def test_whatever_is_no_file_among_a_checkpoint_is_damage_and_named(folder, kind):
+    """Each file is replaced by it, the manifest, too; and it is put beside them."""
+    newest = folder / "2"
+    kept = {path: path.read_bytes() for path in files_of(newest)}
+    for path in (*kept, newest / manifest.NAME, newest / "state" / "new"):
+        # given
+        content = path.read_bytes() if path.exists() else None
+        path.unlink(missing_ok=True)
+        places = {"device": "/dev/zero", "kernel": "/proc/self/status", "dangling link": "nowhere"}
+        if kind == "pipe":
+            os.mkfifo(path)
+        else:
+            path.symlink_to(places.get(kind, folder))
+
+        # when, then
+        with pytest.raises(manifest.Damaged, match=path.name):
+            manifest.verify(newest)
+        path.unlink()
+        if content is not None:
+            path.write_bytes(content)
+    manifest.verify(newest)

@@ -60,6 +60,12 @@ def state_of(workdir):
         return checkpoints.restore(samples.fresh())[0]
 
 
+def measured_by(workdir):
+    """The lines of the metrics, without what depends on the time of day and the machine."""
+    timed = ("time", "steps_per_second", "training_seconds", "processor_seconds")
+    return [{k: v for k, v in line.items() if k not in timed} for line in lines_of(workdir)]
+
+
 def lines_of(workdir):
     lines = (workdir / "metrics.jsonl").read_text().splitlines()
     return [json.loads(line) for line in lines]
@@ -249,6 +255,34 @@ def test_asked_to_stop_it_saves_and_goes_on_to_the_same_end(
 
     assert run(config(corpus_file), tmp_path) == whole[1]
     assert_same(state_of(tmp_path), state_of(whole[0]))
+    assert measured_by(tmp_path) == measured_by(whole[0])
+
+
+@pytest.mark.parametrize("stopped_after", [3, 5])
+def test_the_metrics_after_a_stop_are_those_of_a_run_that_went_on(
+    corpus_file, tmp_path, whole, monkeypatch, stopped_after
+):
+    # given a stop between two lines of the metrics, or at one
+    train_step = step.train_step
+
+    def asked(state, batch, **named):
+        if int(state.step) == stopped_after - 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return train_step(state, batch, **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(step, "train_step", asked)
+        with pytest.raises(Stopped, match=f"stopped at step {stopped_after} of 16"):
+            run(config(corpus_file), tmp_path)
+
+    # when
+    run(config(corpus_file), tmp_path)
+
+    # then
+    assert measured_by(tmp_path) == measured_by(whole[0])
+    assert all(
+        np.isfinite(line["steps_per_second"]) for line in lines_of(tmp_path) if "loss" in line
+    )
 
 
 def test_weights_to_start_from_are_measured_first_and_kept_if_no_better_come(

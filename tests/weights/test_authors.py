@@ -58,38 +58,107 @@ def test_files_without_torch_give_what_the_tensors_give(tmp_path, suffix):
     same(convert(path), from_state_dict(state))
 
 
+class Tensor:
+    """What the converter asks of a tensor of PyTorch, which is too large for the tests."""
+
+    layout = "strided"
+
+    def __init__(self, value):
+        self.value = value
+
+    def is_floating_point(self):
+        return self.value.dtype.kind == "f"
+
+    def numel(self):
+        return self.value.size
+
+    def to(self, dtype):
+        return Tensor(self.value.astype(dtype))
+
+    def numpy(self):
+        return self.value
+
+
+@pytest.fixture
+def torch_file(tmp_path, monkeypatch):
+    """Writes a file that the stand-in for PyTorch reads as the given content."""
+
+    def write(content, name="authors.pth"):
+        def load(stream, *, map_location, weights_only):
+            assert map_location == "cpu" and weights_only is True
+            assert stream.read() == b"bytes"
+            return content
+
+        torch = types.SimpleNamespace(
+            load=load, float32=np.float32, Tensor=Tensor, strided="strided"
+        )
+        monkeypatch.setitem(sys.modules, "torch", torch)
+        (tmp_path / name).write_bytes(b"bytes")
+        return tmp_path / name
+
+    return write
+
+
 @pytest.mark.parametrize("wrapped", [True, False])
-def test_a_pytorch_file_is_read_as_tensors_alone(tmp_path, monkeypatch, wrapped):
-    # torch itself is too large for the tests, so a stand-in records how it is called
+def test_a_pytorch_file_is_read_as_tensors_alone(torch_file, wrapped):
     state = authors.random_state_dict(2)
+    tensors = {name: Tensor(value) for name, value in state.items()}
 
-    class Tensor:
-        def __init__(self, value):
-            self.value = value
-
-        def to(self, dtype):
-            return Tensor(self.value.astype(dtype))
-
-        def numpy(self):
-            return self.value
-
-    def load(path, *, map_location, weights_only):
-        assert map_location == "cpu" and weights_only is True
-        tensors = {name: Tensor(value) for name, value in state.items()}
-        return {"state_dict": tensors, "epoch": 3} if wrapped else tensors
-
-    torch = types.SimpleNamespace(load=load, float32=np.float32)
-    monkeypatch.setitem(sys.modules, "torch", torch)
-    path = tmp_path / "authors.pth"
-    path.write_bytes(b"")
+    path = torch_file({"state_dict": tensors, "epoch": 3} if wrapped else tensors)
 
     same(convert(path), from_state_dict(state))
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ([1, 2], "holds a list, wanted a dict of tensors"),
+        ({"state_dict": 3}, "holds a int, wanted a dict of tensors"),
+        ({1: Tensor(np.zeros(1))}, "1 is the name of a tensor, wanted text"),
+        ({"epoch": 3}, "'epoch' is no tensor"),
+        ({"\x1b[2J" * 500: 3}, r"is no tensor"),
+        ({}, "names of its tensors match none"),
+        # of one number, as `expand` makes it: 12 GB
+        ({"big": Tensor(np.broadcast_to(np.float32(0), (3 << 30,)))}, "holds 12,884,901,888 bytes"),
+    ],
+)
+def test_a_pytorch_file_of_something_else_is_refused(torch_file, content, told):
+    with pytest.raises(ValueError, match=told) as caught:
+        convert(torch_file(content))
+    assert len(str(caught.value)) <= 600 and "\x1b" not in str(caught.value)
+
+
+def test_an_archive_that_unfolds_to_much_more_is_refused_before_it_is_unfolded(tmp_path):
+    np.savez_compressed(tmp_path / "bomb.npz", **{"weights_net.a": np.zeros(40 << 20, np.float32)})
+    with pytest.raises(
+        ValueError, match="bomb.npz .*holds 167,.* bytes of tensors, wanted at most"
+    ):
+        convert(tmp_path / "bomb.npz")
+
+
+def test_more_iterations_than_can_be_traced_are_refused():
+    state = {f"feat_extractor_xyz.nets_a.{i}.0.weight": np.zeros(1) for i in range(100_000)}
+    with pytest.raises(ValueError, match="it has 100,000 iterations, wanted at most 100"):
+        from_state_dict(state)
+
+
+@pytest.mark.parametrize("state", [{1: np.zeros(3)}, {"a": [1.0]}, {None: np.zeros(3)}])
+def test_a_state_that_is_no_dict_of_arrays_by_name_is_refused(state, unchecked):
+    with pytest.raises(ValueError, match="wanted arrays under names that are text"):
+        from_state_dict(state)
+
+
+def test_of_many_faults_the_first_are_named_and_the_others_counted():
+    state = authors.random_state_dict(0) | {f"extra_{i}": np.zeros(1) for i in range(5000)}
+    with pytest.raises(ValueError, match=r"extra_0 is unknown; .*; and 4[0-9]+ more$") as caught:
+        from_state_dict(state)
+    assert len(str(caught.value)) <= 600
 
 
 def test_without_torch_the_message_says_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     path = tmp_path / "authors.pth"
-    path.write_bytes(b"")
+    path.write_bytes(b"bytes")
 
     with pytest.raises(ValueError, match=r'pip install "cfr_jax\[torch\]"') as caught:
         convert(path)

@@ -114,10 +114,60 @@ def test_what_cannot_be_exported_is_refused_by_name(tiny, unchecked):
         export_register(tiny, points=64, platforms=("cpu", "gpu"), settings=SETTINGS)
 
 
+def test_every_program_with_a_flipped_bit_is_refused(written, tmp_path):
+    # given
+    whole = written.read_bytes()
+    generator = np.random.default_rng(0)
+    path = tmp_path / "model.stablehlo"
+    bits = {*range(8 * 64), *generator.integers(0, 8 * len(whole), 1500).tolist()}
+
+    for bit in sorted(bits):
+        # when
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+
+        # then
+        with pytest.raises(ValueError, match="damaged"):
+            load_exported(path)
+
+
+def test_a_program_without_a_digest_is_refused_and_jax_reads_it_at_the_documented_place(written):
+    plain = written.with_name("plain.stablehlo")
+    plain.write_bytes(written.read_bytes()[32:])
+    with pytest.raises(ValueError, match="first 32 bytes are not the SHA-256 of the rest"):
+        load_exported(plain)
+    assert jax.export.deserialize(bytearray(plain.read_bytes())).in_avals[0].shape == (CAPACITY, 6)
+
+
+def test_a_program_of_something_else_is_refused(tmp_path):
+    square = jax.jit(lambda numbers: numbers**2)
+    for arguments in ([jnp.ones(3)], [jnp.ones((3, 3))]):
+        save_exported(tmp_path / "other.stablehlo", jax.export.export(square)(*arguments))
+        with pytest.raises(ValueError, match="other.stablehlo .*not one of `register`"):
+            load_exported(tmp_path / "other.stablehlo")
+
+
+def example():
+    spec = importlib.util.spec_from_file_location("run_exported", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_example_loads_what_is_whole_and_refuses_what_is_damaged(written, tmp_path):
+    assert example().load(written).in_avals[0].shape == (CAPACITY, 6)
+    damaged = bytearray(written.read_bytes())
+    damaged[-100] ^= 1
+    (tmp_path / "damaged.stablehlo").write_bytes(damaged)
+    with pytest.raises(ValueError, match="is damaged"):
+        example().load(tmp_path / "damaged.stablehlo")
+
+
 @pytest.mark.parametrize("content", [b"", b"nonsense", bytes(range(256)) * 9])
 def test_a_file_that_holds_no_program_is_refused_by_name(content, tmp_path):
     (tmp_path / "model.stablehlo").write_bytes(content)
-    with pytest.raises(ValueError, match="model.stablehlo is not an exported program"):
+    with pytest.raises(ValueError, match="model.stablehlo is (empty|not an exported program)"):
         load_exported(tmp_path / "model.stablehlo")
 
 
@@ -161,19 +211,16 @@ def test_the_example_needs_only_jax_and_numpy_and_uses_the_callers_frame(tiny, t
         if isinstance(node, ast.Import)
         for name in node.names
     }
-    spec = importlib.util.spec_from_file_location("run_exported", EXAMPLE)
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
     exported = export_register(tiny, points=CAPACITY, settings=SETTINGS)
     source, target = cloud(48, 0)[:, :3].astype(float), cloud(40, 1)[:, :3].astype(float)
     shift, size = np.array([5e5, -3.0, 10.0]), 250.0
 
     # when
-    here = example.register(exported, source, target)
-    far = example.register(exported, size * source, size * target + shift)
+    here = example().register(exported, source, target)
+    far = example().register(exported, size * source, size * target + shift)
 
     # then
-    assert imported == {"sys", "jax", "numpy"}
+    assert imported == {"hashlib", "sys", "jax", "numpy"}
     centers = source.mean(0), target.mean(0)
     scale = max(
         np.linalg.norm(part - center, axis=1).max()

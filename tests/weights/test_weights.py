@@ -1,9 +1,12 @@
 """Weights on disk: saved weights are read back, and all other files are refused."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors.numpy import load_file, save_file
 
 from cfr_jax.networks import rpmnet
@@ -197,3 +200,56 @@ def test_every_shipped_file_is_sound():
 
         assert found.name == name
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found.params))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_are_refused_with_the_right_digest(fresh, tmp_path, value):
+    # given
+    names = sorted(flatten_dict(fresh, sep="/"))
+    path = tmp_path / "poisoned.safetensors"
+    for name in names[:: len(names) // 5]:
+        flat = {key: np.array(leaf) for key, leaf in flatten_dict(fresh, sep="/").items()}
+        flat[name].flat[-1] = value
+        tree = unflatten_dict(flat, sep="/")
+        save_params(path, tree)
+
+        # when, then
+        with pytest.raises(ValueError, match=f"poisoned.*: {name} holds a number that is not fin"):
+            read_weights(path)
+
+
+def test_a_bias_that_claims_a_million_iterations_is_refused_before_it_is_traced(fresh, tmp_path):
+    tree = jax.tree.map(np.asarray, fresh)
+    tree["annealing"]["out"]["bias"] = np.zeros(4 << 20, np.float32)
+    save_params(tmp_path / "long.safetensors", tree)
+    with pytest.raises(ValueError, match="for 2,097,152 iterations, wanted at most 100"):
+        read_weights(tmp_path / "long.safetensors")
+
+
+def _with_type(path, kind, size):
+    """A safetensors file of one tensor of a type, made by hand: numpy has not all of them."""
+    header = {
+        "cascade/kernel": {"dtype": kind, "shape": [4], "data_offsets": [0, 4 * size]},
+        "__metadata__": {"sha256": "0" * 64},
+    }
+    text = json.dumps(header).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + bytes(4 * size))
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [("F8_E4M3", 1), ("F8_E5M2", 1), ("BF16", 2), ("F16", 2), ("U8", 1), ("C64", 8), ("X9", 1)],
+)
+def test_tensors_of_any_type_are_refused_in_words(kind, size, tmp_path):
+    path = tmp_path / "typed.safetensors"
+    _with_type(path, kind, size)
+    with pytest.raises(ValueError, match="^weights: .*typed.safetensors") as caught:
+        read_weights(path)
+    assert len(str(caught.value)) <= 600
+
+
+@pytest.mark.parametrize("name", ["", "no\0thing", "x" * 5000, "/dev/null", "/"])
+def test_a_path_that_is_no_file_of_weights_is_refused(name):
+    with pytest.raises(ValueError, match="^weights: ") as caught:
+        read_weights(name)
+    assert len(str(caught.value)) <= 600

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from pathlib import Path
+
+from cfr_jax.runtime.private import make_private
+from cfr_jax.runtime.words import Refused
 
 
 def keep_compiled_programs() -> None:
@@ -12,7 +16,8 @@ def keep_compiled_programs() -> None:
 
     `CFR_JAX_CACHE` names another folder, or is "off". If JAX already has a cache
     (`JAX_COMPILATION_CACHE_DIR`), it stays as it is. Without a writable folder, calls are only
-    slower.
+    slower. A folder that belongs to another user, or that others may write into, is not used, and
+    standard error says so: whoever can write there could give any answer.
     """
     import jax
 
@@ -21,7 +26,14 @@ def keep_compiled_programs() -> None:
         return
     try:
         folder = Path(wish) if wish else _user_folder()
-        folder.mkdir(parents=True, exist_ok=True)
+        make_private(folder)
+    except Refused as error:
+        print(
+            f"cfr: warning: {error}, so compiled programs are not kept there\n"
+            "remove the folder, or name another one by CFR_JAX_CACHE",
+            file=sys.stderr,
+        )
+        return
     except (OSError, RuntimeError):  # a file in the way, a read-only home, no home
         return
     if not os.access(folder, os.W_OK):

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 from cfr_jax.data.kinds import corpus
 from cfr_jax.data.kinds.kind import DataKind
+from cfr_jax.runtime.reading import text
+from cfr_jax.runtime.words import Refused
 
 if TYPE_CHECKING:
     from cfr_jax.data.pairs import Pair
@@ -18,7 +20,10 @@ def recognize(path: Path) -> str | None:
     lists = ("train_files.txt", "test_files.txt")
     if not path.is_dir() or not all((path / name).is_file() for name in lists):
         return None
-    train, test = (len((path / name).read_text().split()) for name in lists)
+    try:
+        train, test = (len(text(path / name, 1 << 20).split()) for name in lists)
+    except Refused:
+        return None
     return f"ModelNet40 in HDF5, {train} files of training shapes and {test} of test shapes"
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import io
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cfr_jax.data.kinds.kind import DataKind, Listing
+from cfr_jax.runtime.reading import opened
+from cfr_jax.runtime.sequences import OnDemand
+from cfr_jax.runtime.words import Refused, shown
 
 if TYPE_CHECKING:
     from cfr_jax.data.pairs import Pair
@@ -19,12 +24,16 @@ def recognize(path: Path) -> str | None:
     """Looks at the suffix and counts the lines, but does not check whether each is a pair."""
     if not path.is_file() or path.suffix.lower() not in _SUFFIXES:
         return None
+    count = 0
     try:
-        lines = path.read_text("utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError):
+        with opened(path) as stream, io.TextIOWrapper(stream, "utf-8-sig") as text:
+            for line in text:
+                count += bool(line.strip()) and not line.startswith("#")
+    except UnicodeDecodeError:
         return None
-    rows = [line for line in lines if line.strip() and not line.startswith("#")]
-    return f"a list of {len(rows)} lines, one pair per line"
+    except Refused as error:
+        return "a list of 0 lines" if str(error) == "is empty" else None
+    return f"a list of {count} lines, one pair per line"
 
 
 def train(path: str | Path, cache: Path, *, frames: tuple[int, int] | None = None) -> SceneSource:
@@ -61,13 +70,19 @@ def list_pairs(path: Path) -> Listing:
     from cfr_jax.data.pairs import CsvPairs
 
     held = CsvPairs(path)
-    places = [(path.parent / source, path.parent / target) for source, target in held.listed]
-    if not any(file.exists() for place in places for file in place):
-        raise ValueError(
-            f"{path}: none of the files of its {len(places)} pairs exists, such as {places[0][0]}\n"
+    listed = held.listed
+    if not any(os.path.exists(path.parent / file) for pair in listed for file in pair):
+        raise Refused(
+            f"{shown(path)}: none of the files of its {len(held)} pairs exists, such as "
+            f"{shown(path.parent / listed[0][0])}\n"
             "wanted lines of `source,target`, paths relative to the folder of the list"
         )
-    return Listing(held.listed, places, "pairs of a list")
+
+    def places(row: int) -> tuple[Path, Path]:
+        source, target = listed[row]
+        return path.parent / source, path.parent / target
+
+    return Listing(listed, OnDemand(len(held), places), "pairs of a list")
 
 
 def _refuse(frames: object, path: str | Path) -> None:

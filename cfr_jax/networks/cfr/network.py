@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
 
 import jax
 import numpy as np
+from flax.traverse_util import flatten_dict
 
 from cfr_jax.networks.annealing import AUTHORS_LAYERS
 from cfr_jax.networks.cfr.iterations import bind, heavy_features, iterations_of, unroll
@@ -24,8 +26,11 @@ from cfr_jax.networks.parts import (
     move,
     on_host,
 )
+from cfr_jax.networks.probability import uncalibrated
 from cfr_jax.networks.record import Checkpoint, Network, Params, Part, Place, places_of
 
+# Tracing takes a time that grows with them, and files may claim any number.
+MOST_ITERATIONS = 100
 _LAYERS = (
     *AUTHORS_LAYERS,
     ("feat_extractor_ball.prepool.0", "features/kernel_0", "features/bias_0"),
@@ -55,9 +60,14 @@ def _recognizes(tensors: Collection[str]) -> bool:
 
 
 def _arguments(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
-    annealing = shapes.get("annealing/out/bias", (10,))
+    annealing = math.prod(shapes.get("annealing/out/bias", (10,)))
     shared = shapes.get("cascade/kernel", ())[:1] == (1,)
-    return {"iterations": max(1, int(np.prod(annealing)) // 2), "shared": shared}
+    if annealing > 2 * MOST_ITERATIONS:
+        raise ValueError(
+            f"annealing/out/bias is for {annealing // 2:,} iterations, wanted at most "
+            f"{MOST_ITERATIONS}"
+        )
+    return {"iterations": max(1, annealing // 2), "shared": shared}
 
 
 def _theirs(tensors: Collection[str]) -> bool:
@@ -65,7 +75,10 @@ def _theirs(tensors: Collection[str]) -> bool:
 
 
 def _iterations_of_theirs(tensors: Collection[str]) -> dict[str, Any]:
-    return {"iterations": max(1, len({m[1] for m in map(_ITERATION.match, tensors) if m}))}
+    found = {m[1] for m in map(_ITERATION.match, tensors) if m}
+    if len(found) > MOST_ITERATIONS:
+        raise ValueError(f"it has {len(found):,} iterations, wanted at most {MOST_ITERATIONS}")
+    return {"iterations": max(1, len(found))}
 
 
 def _places(tensors: Collection[str]) -> dict[str, Place]:
@@ -74,6 +87,28 @@ def _places(tensors: Collection[str]) -> dict[str, Place]:
         rows = [(theirs.format(i), *ours) for theirs, *ours in _LAYERS_PER_ITERATION]
         found |= places_of(rows, stacked=True)
     return found
+
+
+_PARAMETERS = frozenset(place.path for place in _places(()).values())
+
+
+def check_params(params: Any) -> None:
+    """Raises ValueError unless all parameters of CFR are there, as arrays under their names."""
+    wanted = "wanted the parameters of load_params"
+    if not isinstance(params, Mapping):
+        raise ValueError(f"params: got a {type(params).__name__}, {wanted}")
+    try:
+        found = flatten_dict(uncalibrated(params), sep="/")
+    except (TypeError, AttributeError):  # names that are no text
+        found = {}
+    lacking = sorted(_PARAMETERS - found.keys())
+    if lacking:
+        some = "empty" if not params else f"without {lacking[0]}"
+        raise ValueError(f"params: got a dict that is {some}, {wanted}")
+    for name in sorted(_PARAMETERS):
+        if not hasattr(found[name], "shape"):
+            kind = type(found[name]).__name__
+            raise ValueError(f"params: got a {kind} as {name}, {wanted}")
 
 
 def parts(params: Params, settings: Settings) -> Callable[[Cloud, Cloud], Iterator[Part]]:

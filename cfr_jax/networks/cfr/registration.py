@@ -8,6 +8,7 @@ expects such clouds. `align` takes clouds of any size and place and converts bot
 from __future__ import annotations
 
 import functools
+from numbers import Integral
 from typing import Any
 
 import jax
@@ -19,6 +20,7 @@ from jaxtyping import Array, Float
 
 from cfr_jax.geometry import rigid
 from cfr_jax.networks.cfr.iterations import Encoded, encoded, iterate, iterations_of, moved_on
+from cfr_jax.networks.cfr.network import check_params
 from cfr_jax.networks.clues import NetworkClues, of_network, of_registration
 from cfr_jax.networks.inputs import Cloud, Settings, check_points, prepare
 from cfr_jax.networks.probability import calibration_of
@@ -62,6 +64,7 @@ def encode(
     Pass the result to `register` as the target, with the same settings. Raises ValueError as
     `register` does.
     """
+    check_params(params)
     clouds = {"target": target}
     finite = _checked(clouds)
     encoded = _encode(params, target, settings=settings)
@@ -100,6 +103,10 @@ def register(
     shapes and for values that are not finite. Inside `jit` and `vmap` the values are not known, and
     NaN in gives NaN out.
     """
+    check_params(params)
+    for name, count in (("iterations", iterations), ("cascades", cascades)):
+        if count is not None and (isinstance(count, bool) or not isinstance(count, Integral)):
+            raise ValueError(f"{name}: got {count!r}, wanted a whole number of at least 1")
     clouds = {"source": source, "target": target}
     finite = _checked(clouds)
     found = _register(

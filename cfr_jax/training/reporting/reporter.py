@@ -15,6 +15,7 @@ from cfr_jax.training.devices import is_first
 from cfr_jax.training.losses import PairLoss
 from cfr_jax.training.reporting.board import Board
 from cfr_jax.training.reporting.log import Bar, Clock, MetricsLog, read_journal, summarize
+from cfr_jax.training.reporting.pending import pack, unpack
 from cfr_jax.training.reporting.summary import write_summary
 from cfr_jax.training.stopping import Stopped
 from cfr_jax.training.task import Task
@@ -34,9 +35,11 @@ class Reporter:
     def __init__(self, workdir: Path, task: Task, about: dict[str, Any]):
         self.clock: Clock = Clock(**about["clock"])
         self._workdir, self._task, self._about = workdir, task, about
-        self._waiting: list[PairLoss] = []
-        self._steps = 0  # steps that are measured but not yet written
-        self._written = self.clock.read()["seconds"]
+        # what was measured and not yet written, perhaps before an interruption
+        before = about["pending"]
+        self._waiting = unpack(before.get("measured", ()))
+        self._steps = before.get("steps", 0)
+        self._written = before.get("written", self.clock.read()["seconds"])
         self._compiling = False
         self._bar = Bar(task.steps, about["step"], shown=is_first())
         self._journal = self._board = None
@@ -123,6 +126,16 @@ class Reporter:
             self._board.training(line, self._waiting)
         self._waiting, self._steps, self._written = [], 0, used["seconds"]
         self._bar.measured(line)
+
+    def pending(self) -> dict[str, Any]:
+        """What a checkpoint has to know, so that a run that goes on writes the same lines."""
+        if not self._waiting:
+            return {}
+        return {
+            "measured": pack(self._waiting),
+            "steps": self._steps,
+            "written": self._written,
+        }
 
     def validated(self, done: int, found: dict[str, Any]) -> None:
         """Writes a validation; `found["transforms"]` (b, L, 4, 4) is for the pictures."""
