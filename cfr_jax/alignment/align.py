@@ -13,6 +13,7 @@ from jaxtyping import Float
 from cfr_jax.alignment import confidence
 from cfr_jax.alignment.answers import Alignment, answer
 from cfr_jax.alignment.case import Case
+from cfr_jax.alignment.choosing import keep_start
 from cfr_jax.alignment.planning import Plan, planned
 from cfr_jax.alignment.refining import refine_every_point, refine_used_points
 from cfr_jax.alignment.search import search
@@ -53,7 +54,9 @@ def align(
     makes the score worse.
 
     `initial` (4, 4) moves the source close to the target first. Without it, the centroids are laid
-    on each other. The network is trained for up to 45 degrees about each axis from there. If there
+    on each other. The network is trained for up to 45 degrees about each axis from there. A given
+    start is also refined as it is, and kept where the clouds lie better on each other than after
+    the network, told by all points both ways (`choosing.misfit`). If there
     are several starts (k, 4, 4), all are tried on thinned clouds, and the one from which the clouds
     fit best is taken. "global" tries starts that cover all rotations (`search`). This takes several
     times as long, and also reports other motions that fit about as well. Without `initial`, a
@@ -109,9 +112,21 @@ def steps(
     if plan.starts is not None:
         yield search
     yield functools.partial(solve_case, refine=traced)
+    yield from after_network(plan, refinements, second_look=second_look)
+
+
+def after_network(
+    plan: Plan, refinements: tuple[Refinement, ...], *, second_look: bool
+) -> Iterator[Callable[[Case], Case]]:
+    """The steps from what the network found for a plan to its answer."""
+    traced = refinements[0] if refinements and refinements[0].traceable else None
     if second_look and traced is not None and plan.starts is None:
         yield functools.partial(look_again, refine=traced)
-    yield from on_host(plan, refinements)
+    last = tuple(on_host(plan, refinements))
+    if refinements and (plan.start_given or plan.starts is not None):
+        yield functools.partial(keep_start, refine=traced, finish=last)
+    else:
+        yield from last
 
 
 def on_host(plan: Plan, refinements: tuple[Refinement, ...]) -> Iterator[Callable[[Case], Case]]:
