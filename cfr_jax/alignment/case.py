@@ -33,14 +33,14 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What a search found; motions map source onto target, the best first."""
+    """What a search found; motions map source onto target, the one with the least misfit first."""
 
     unit_motions: Float[np.ndarray, "k 4 4"]
     """Of the unit clouds of the plan."""
     motions: Float[np.ndarray, "k 4 4"]
     """Of the caller's clouds."""
     fits: Float[np.ndarray, " k"]
-    """`quality.mutual_fit` of each, on the full clouds; never rising."""
+    """`quality.mutual_fit` of each, on the points that the network sees."""
     frames: units.Frames
     starts: int
     """How many were tried."""

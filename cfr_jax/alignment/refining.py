@@ -43,7 +43,7 @@ def refine_every_point(case: Case, *, refine: Refinement) -> Case:
     began = time.perf_counter()
     case = placed(case)
     found = case.solved()
-    fit = refine(*surfaces(case), motion(case))
+    fit = refine(*surfaces(case), to_placed(case, np.asarray(found.transform)))
     transform = _of_plan(case, np.asarray(fit.transform, np.float64))
     found = dataclasses.replace(
         found,
@@ -60,7 +60,8 @@ def refine_every_point(case: Case, *, refine: Refinement) -> Case:
 def measured(case: Case) -> Case:
     """The case with the quality of its motion on the clouds that are `placed`."""
     found = case.solved()
-    told = measuring.measure(*surfaces(case), motion(case), solving.DISTANCE)
+    transform = to_placed(case, np.asarray(found.transform))
+    told = measuring.measure(*surfaces(case), transform, solving.DISTANCE)
     quality = dataclasses.replace(found.quality, **vars(told))
     return dataclasses.replace(case, found=dataclasses.replace(found, quality=quality))
 
@@ -80,10 +81,10 @@ def surfaces(case: Case) -> tuple[HostSurface, HostSurface]:
     return case.placed.source, case.placed.target
 
 
-def motion(case: Case) -> Float[np.ndarray, "4 4"]:
-    """The answer so far, between the clouds that are `placed`; float64."""
+def to_placed(case: Case, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """A motion between the plan's unit clouds as one between the clouds that are `placed`."""
     assert case.placed is not None
-    transform = np.asarray(case.solved().transform, np.float64)
+    transform = np.asarray(transform, np.float64)
     if case.placed.frames is case.plan.frames:
         return transform
     return case.placed.frames.to_unit(case.plan.frames.to_caller(transform))

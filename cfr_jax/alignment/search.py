@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import time
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Float
 
-from cfr_jax.alignment import planning, quality
+from cfr_jax.alignment import choosing, planning, quality, refining
 from cfr_jax.alignment.case import Case, Search
 from cfr_jax.alignment.solving import DeviceCloud, on_accelerator, on_device, surface, timed
 from cfr_jax.geometry import rigid, units
@@ -50,7 +51,7 @@ class Candidates:
 programs.storable(Candidates)
 
 
-@functools.partial(jax.jit, static_argnames=("kept", "at_once"))
+@functools.partial(jax.jit, static_argnames=("kept", "at_once", "as_given"))
 def propose(
     params: Params,
     source: DeviceCloud,
@@ -59,11 +60,13 @@ def propose(
     *,
     kept: int = KEPT,
     at_once: int = 1,
+    as_given: bool = False,
 ) -> Candidates:
     """Where the network ends on coarse clouds from each start: the `kept` that fit best and differ.
 
     `at_once` starts go through the network together (`vmap`); the target is encoded once. Where
-    fewer than `kept` differ, the rest have a fit of -1.
+    starts are to be respected `as_given`, each is also refined without the network. Where fewer
+    than `kept` differ, the rest have a fit of -1.
     """
     sides = source.prepared(COARSE), target.prepared(COARSE)
     encoded = encode(params, sides[1], settings=COARSE)
@@ -71,11 +74,14 @@ def propose(
 
     def end(start: Array) -> tuple[Array, Array]:
         found = register(params, moved_by(start, sides[0]), encoded, settings=COARSE)
-        motion = rigid.compose(found.transform, start)
-        return motion, quality.mutual_fit(*surfaces, motion, _COARSE_REACH)
+        ends = [rigid.compose(found.transform, start)]
+        if as_given:
+            ends.append(jnp.asarray(generalized_icp.refine(*surfaces, start).transform))
+        fits = [quality.mutual_fit(*surfaces, motion, _COARSE_REACH) for motion in ends]
+        return jnp.stack(ends), jnp.stack(fits)
 
     motions, fits = lax.map(end, starts, batch_size=at_once if at_once > 1 else None)
-    return _distinct(motions, fits, kept)
+    return _distinct(motions.reshape(-1, 4, 4), fits.ravel(), kept)
 
 
 @jax.jit
@@ -92,15 +98,32 @@ def polish(source: DeviceCloud, target: DeviceCloud, found: Float[Array, "k 4 4"
 
 
 def search(case: Case) -> Case:
-    """The plan started where its source comes to lie best on its target, of all `plan.starts`."""
+    """The plan started where its source comes to lie best on its target, of all starts given."""
     assert case.plan.starts is not None
-    searched = tried(case, case.plan.starts)
-    plan = case.plan.started_at(searched.unit_motions[0])
-    return dataclasses.replace(case, plan=plan, searched=searched)
+    return started(tried(case, case.plan.starts, as_given=True))
 
 
-def tried(case: Case, starts: Float[np.ndarray, "s 4 4"], *, nearby: bool = False) -> Search:
-    """The best motions of the case's source onto its target from all `starts` of unit clouds."""
+def started(case: Case) -> Case:
+    """The case at the best motion that was just `tried`."""
+    assert case.searched is not None
+    plan = case.plan.started_at(case.searched.unit_motions[0])
+    return dataclasses.replace(case, plan=plan)
+
+
+def tried(
+    case: Case,
+    starts: Float[np.ndarray, "s 4 4"],
+    *,
+    beside: Float[np.ndarray, "b 4 4"] | None = None,
+    nearby: bool = False,
+    as_given: bool = False,
+) -> Case:
+    """The case with what was `searched`: the best motions of its source onto its target, from all
+    `starts` of unit clouds.
+
+    Motions `beside` them are refined without the network. `as_given` says that the starts are to be
+    respected, too. What is best is told by the fewest misfits of all points (`choosing.misfit`).
+    """
     plan = case.plan
     at_once = _AT_ONCE if on_accelerator() else 1
     coarse = on_device(
@@ -116,19 +139,28 @@ def tried(case: Case, starts: Float[np.ndarray, "s 4 4"], *, nearby: bool = Fals
         )
     )
     arguments = (case.params, *coarse, jnp.asarray(starts, jnp.float32))
-    proposed = timed(case.seconds, propose, *arguments, at_once=at_once)
+    proposed = timed(case.seconds, propose, *arguments, at_once=at_once, as_given=as_given)
+    motions = proposed.motions
+    if beside is not None and len(beside):
+        motions = jnp.concatenate([motions, jnp.asarray(beside, jnp.float32)])
     whole = on_device(plan.source, plan.target)
-    found = timed(case.seconds, polish, *whole, proposed.motions)
+    found = timed(case.seconds, polish, *whole, motions)
+    began = time.perf_counter()
     real = np.asarray(found.fits) >= 0
     unit_motions = np.asarray(found.motions, np.float64)[real]
-    return Search(
-        unit_motions=unit_motions,
-        motions=plan.frames.to_caller(unit_motions),
-        fits=np.asarray(found.fits, np.float64)[real],
+    case = refining.placed(case)
+    misfits = [choosing.misfit_of(case, motion) for motion in unit_motions]
+    order = np.argsort(misfits, kind="stable")
+    case.seconds["run"] += time.perf_counter() - began
+    searched = Search(
+        unit_motions=unit_motions[order],
+        motions=plan.frames.to_caller(unit_motions[order]),
+        fits=np.asarray(found.fits, np.float64)[real][order],
         frames=plan.frames,
         starts=len(starts),
         nearby=nearby,
     )
+    return dataclasses.replace(case, searched=searched)
 
 
 def rivals(searched: Search, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "a 4 4"]:
@@ -136,7 +168,7 @@ def rivals(searched: Search, transform: Float[np.ndarray, "4 4"]) -> Float[np.nd
     frames, fits = searched.frames, searched.fits
     unit, mine = frames.to_unit(searched.motions), frames.to_unit(transform)
     near = np.array([bool(same(*jnp.array([mine, other], jnp.float32))) for other in unit])
-    return searched.motions[(fits >= RIVAL * fits[0]) & ~near]
+    return searched.motions[(fits >= RIVAL * fits.max()) & ~near]
 
 
 def same(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Array:

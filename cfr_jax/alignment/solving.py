@@ -109,7 +109,7 @@ def judged(source: DeviceCloud, target: DeviceCloud, found: Found) -> Found:
     """`found` with the quality and the clues of its transform, which somebody put there."""
     cloud = target.prepared()
     surfaces = surface(source.prepared()), surface(cloud)
-    measured, clues = _judge(found.registration, found.transform, cloud, surfaces)
+    measured, clues = _judge(found.registration, jnp.asarray(found.transform), cloud, surfaces)
     return dataclasses.replace(found, quality=measured, clues=clues)
 
 

@@ -79,13 +79,24 @@ def test_a_start_that_is_right_is_kept(kept):
     assert degrees < 2 and meters < 0.5
 
 
-def test_a_start_that_refinement_makes_right_is_kept():
-    source, target = quarter_seen(180)
+def test_a_start_that_refinement_makes_right_is_kept(kept):
+    (source, target), _ = kept
+    near = solids.motion(1, (1, 0, 1), (0.2, -0.2, 0.1)) @ TRUTH
 
-    found = align(source, target, initial=np.eye(4))
+    found = align(source, target, initial=near)
+
+    assert off(near, source)[1] > 0.3
+    degrees, meters = off(found.transform, source)
+    assert degrees < 2 and meters < 0.5
+
+
+def test_of_several_starts_one_that_is_right_is_kept(kept):
+    (source, target), _ = kept
+    wrong = TRUTH @ solids.motion(120, (0, 0, 1), (3, 0, 0))
+
+    found = align(source, target, initial=np.stack([wrong, TRUTH]))
 
     degrees, meters = off(found.transform, source)
-    assert off(found.transforms[-1], source)[1] > 5
     assert degrees < 2 and meters < 0.5
 
 
