@@ -81,7 +81,7 @@ def test_a_start_that_is_right_is_kept(kept):
 
 def test_a_start_that_refinement_makes_right_is_kept(kept):
     (source, target), _ = kept
-    near = solids.motion(1, (1, 0, 1), (0.2, -0.2, 0.1)) @ TRUTH
+    near = solids.motion(1, (1, 0, 1), (0.3, -0.3, 0.1)) @ TRUTH
 
     found = align(source, target, initial=near)
 
