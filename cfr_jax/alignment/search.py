@@ -22,6 +22,7 @@ from cfr_jax.alignment import choosing, planning, quality, refining
 from cfr_jax.alignment.case import Case, Search
 from cfr_jax.alignment.solving import DeviceCloud, on_accelerator, on_device, surface, timed
 from cfr_jax.geometry import rigid, units
+from cfr_jax.geometry.motions import angle_between
 from cfr_jax.networks.cfr.registration import encode, register
 from cfr_jax.networks.inputs import Settings, moved_by
 from cfr_jax.networks.record import Params
@@ -36,13 +37,14 @@ _AT_ONCE = 32  # starts vectorized together by accelerators; one by one they sta
 _SAME_TURN = 20.0  # degrees
 _SAME_PLACE = 0.2
 RIVAL = 0.95  # of the best fit: so near, the shapes alone do not say which is right
+_FEW = 8  # starts that are refined in full
 _COARSE_REACH = 0.1
 _FULL_REACH = generalized_icp.CUT
 
 
 @struct.dataclass
 class Candidates:
-    """Motions of the source onto the target, the best first, and how well each fits."""
+    """Motions of the source onto the target, and how well each fits."""
 
     motions: Float[Array, "k 4 4"]
     fits: Float[Array, " k"]
@@ -86,21 +88,22 @@ def propose(
 
 @jax.jit
 def polish(source: DeviceCloud, target: DeviceCloud, found: Float[Array, "k 4 4"]) -> Candidates:
-    """Refines each motion on the full clouds, and puts what fits best first."""
+    """Refines each motion on the full clouds, and tells how well it fits."""
     first, second = (surface(cloud.prepared(planning.SETTINGS)) for cloud in (source, target))
 
     def refine(motion: Array) -> tuple[Array, Array]:
         refined = jnp.asarray(generalized_icp.refine(first, second, motion).transform)
         return refined, quality.mutual_fit(first, second, refined, _FULL_REACH)
 
-    motions, fits = lax.map(refine, found)
-    return _distinct(motions, fits, len(found))
+    return Candidates(*lax.map(refine, found))
 
 
 def search(case: Case) -> Case:
     """The plan started where its source comes to lie best on its target, of all starts given."""
     assert case.plan.starts is not None
-    return started(tried(case, case.plan.starts, as_given=True))
+    starts = case.plan.starts
+    few = starts if len(starts) <= _FEW else None
+    return started(tried(case, starts, beside=few, as_given=True))
 
 
 def started(case: Case) -> Case:
@@ -146,16 +149,18 @@ def tried(
     whole = on_device(plan.source, plan.target)
     found = timed(case.seconds, polish, *whole, motions)
     began = time.perf_counter()
-    real = np.asarray(found.fits) >= 0
-    unit_motions = np.asarray(found.motions, np.float64)[real]
+    unit_motions = np.asarray(found.motions, np.float64)
     case = refining.placed(case)
     misfits = [choosing.misfit_of(case, motion) for motion in unit_motions]
-    order = np.argsort(misfits, kind="stable")
+    order: list[int] = []
+    for row in np.argsort(misfits, kind="stable"):
+        if not any(_near(unit_motions[row], unit_motions[kept]) for kept in order):
+            order.append(row)
     case.seconds["run"] += time.perf_counter() - began
     searched = Search(
         unit_motions=unit_motions[order],
         motions=plan.frames.to_caller(unit_motions[order]),
-        fits=np.asarray(found.fits, np.float64)[real][order],
+        fits=np.asarray(found.fits, np.float64)[order],
         frames=plan.frames,
         starts=len(starts),
         nearby=nearby,
@@ -167,7 +172,7 @@ def rivals(searched: Search, transform: Float[np.ndarray, "4 4"]) -> Float[np.nd
     """Motions that differ from `transform` and fit about as well as the best."""
     frames, fits = searched.frames, searched.fits
     unit, mine = frames.to_unit(searched.motions), frames.to_unit(transform)
-    near = np.array([bool(same(*jnp.array([mine, other], jnp.float32))) for other in unit])
+    near = np.array([_near(mine, other) for other in unit])
     return searched.motions[(fits >= RIVAL * fits.max()) & ~near]
 
 
@@ -175,6 +180,12 @@ def same(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Array:
     """Whether two motions of unit clouds are too close to count as different answers."""
     away = jnp.linalg.norm(first[:3, 3] - second[:3, 3])
     return (rigid.rotation_error(first, second) < _SAME_TURN) & (away < _SAME_PLACE)
+
+
+def _near(first: np.ndarray, second: np.ndarray) -> bool:
+    """`same`, on the host."""
+    away = np.linalg.norm(first[:3, 3] - second[:3, 3])
+    return bool(angle_between(first, second) < _SAME_TURN and away < _SAME_PLACE)
 
 
 def _distinct(motions: Array, fits: Array, kept: int) -> Candidates:
