@@ -13,11 +13,10 @@ from jaxtyping import Float
 from cfr_jax.alignment import confidence
 from cfr_jax.alignment.answers import Alignment, answer
 from cfr_jax.alignment.case import Case
-from cfr_jax.alignment.choosing import keep_start
 from cfr_jax.alignment.planning import Plan, planned
 from cfr_jax.alignment.refining import refine_every_point, refine_used_points
 from cfr_jax.alignment.search import search
-from cfr_jax.alignment.second_look import look_again, look_everywhere
+from cfr_jax.alignment.second_look import keep_start, look_again, look_everywhere
 from cfr_jax.alignment.solving import on_accelerator, solve_case
 from cfr_jax.networks.cfr.network import check_params
 from cfr_jax.networks.probability import calibration_of
@@ -56,7 +55,7 @@ def align(
     `initial` (4, 4) moves the source close to the target first. Without it, the centroids are laid
     on each other. The network is trained for up to 45 degrees about each axis from there. A given
     start is also refined as it is, and its answer is kept where the clouds then lie better on each
-    other than after the network, told by all points both ways (`choosing.misfit`). If there are
+    other than after the network, told by all points both ways (`measuring.misfit`). If there are
     several starts (k, 4, 4), all are tried on thinned clouds, and the one from which the clouds fit
     best is taken. "global" also tries starts that cover all rotations (`search`), and takes what it
     finds where it is clearly better than the answer without them. This takes several times as long,

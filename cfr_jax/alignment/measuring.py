@@ -1,4 +1,4 @@
-"""The quality of a motion on all points of the clouds, measured on the host by KD-trees."""
+"""The quality of motions on all points of the clouds, measured on the host by KD-trees."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ import numpy as np
 from flax import struct
 from jaxtyping import Float
 
+from cfr_jax.geometry import motions
+from cfr_jax.refine import all_points
 from cfr_jax.refine.surfaces import HostSurface, closest
+
+_SPACINGS = 2.0  # points of one surface are about half the spacing away from each other
 
 
 @struct.dataclass
@@ -35,3 +39,19 @@ def measure(
         overlap=np.asarray(np.mean(away <= 2 * target.tree.spacing)),
         moments=partners.T @ partners,
     )
+
+
+def misfit(
+    source: HostSurface, target: HostSurface, transform: Float[np.ndarray, "4 4"], distance: float
+) -> float:
+    """How badly two clouds lie on each other under `transform` (source onto target), in [0, 1].
+
+    The mean of two losses: of the source's points to the target and of the target's points to the
+    source, each `all_points.score`, cut at twice the wider spacing of the two clouds, and at
+    `distance` at the most. One way alone, a small part lies well on any dense part of a large
+    cloud.
+    """
+    cut = min(distance, _SPACINGS * max(source.tree.spacing, target.tree.spacing))
+    there = all_points.distances(source, target, transform)
+    back = all_points.distances(target, source, motions.inverse(transform))
+    return (all_points.score(there, cut) + all_points.score(back, cut)) / 2

@@ -66,6 +66,14 @@ def measured(case: Case) -> Case:
     return dataclasses.replace(case, found=dataclasses.replace(found, quality=quality))
 
 
+def misfit(case: Case, transform: Float[np.ndarray, "4 4"] | None = None) -> float:
+    """`measuring.misfit` of the answer of a `placed` case, or of another motion of its unit
+    clouds."""
+    if transform is None:
+        transform = np.asarray(case.solved().transform)
+    return measuring.misfit(*surfaces(case), to_placed(case, transform), solving.DISTANCE)
+
+
 def placed(case: Case) -> Case:
     """The case with its clouds on the host: made once, and kept for other starts of this pair."""
     if case.placed is not None:

@@ -18,7 +18,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Float
 
-from cfr_jax.alignment import choosing, planning, quality, refining
+from cfr_jax.alignment import planning, quality, refining
 from cfr_jax.alignment.case import Case, Search
 from cfr_jax.alignment.solving import DeviceCloud, on_accelerator, on_device, surface, timed
 from cfr_jax.geometry import rigid, units
@@ -125,7 +125,7 @@ def tried(
     `starts` of unit clouds.
 
     Motions `beside` them are refined without the network. `as_given` says that the starts are to be
-    respected, too. What is best is told by the fewest misfits of all points (`choosing.misfit`).
+    respected, too. What is best is told by the fewest misfits of all points (`measuring.misfit`).
     """
     plan = case.plan
     at_once = _AT_ONCE if on_accelerator() else 1
@@ -151,7 +151,7 @@ def tried(
     began = time.perf_counter()
     unit_motions = np.asarray(found.motions, np.float64)
     case = refining.placed(case)
-    misfits = [choosing.misfit_of(case, motion) for motion in unit_motions]
+    misfits = [refining.misfit(case, motion) for motion in unit_motions]
     order: list[int] = []
     for row in np.argsort(misfits, kind="stable"):
         if not any(_near(unit_motions[row], unit_motions[kept]) for kept in order):

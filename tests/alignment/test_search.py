@@ -9,7 +9,7 @@ import pytest
 import solids
 from scipy.spatial import cKDTree
 
-from cfr_jax.alignment import choosing, doubts, quality, search, starts
+from cfr_jax.alignment import doubts, quality, search, second_look, starts
 from cfr_jax.alignment.align import align
 from cfr_jax.alignment.case import Search
 from cfr_jax.geometry.units import Frames, unit_frames
@@ -54,7 +54,7 @@ def test_an_answer_without_a_search_stands_unless_it_is_clearly_beaten(few_start
 
     searched = align(source, target, initial="global", max_points=256)
     beaten = np.array([True])
-    monkeypatch.setattr(choosing, "clearly_better", lambda other, case: beaten.all())
+    monkeypatch.setattr(second_look, "clearly_better", lambda other, case: beaten.all())
     other = align(source, target, initial="global", max_points=256)
 
     np.testing.assert_allclose(searched.transform, plain.transform, atol=1e-6)

@@ -5,7 +5,7 @@ import pytest
 import solids
 from scipy.spatial import cKDTree
 
-from cfr_jax.alignment import choosing
+from cfr_jax.alignment import measuring
 from cfr_jax.alignment.align import align
 from cfr_jax.batch.stream import align_many
 from cfr_jax.refine.surfaces import HostSurface
@@ -139,7 +139,7 @@ def test_the_misfit_looks_both_ways_as_a_kd_tree_does():
     motion = solids.motion(3, translation=(0.02, 0.0, -0.01))
 
     def told(first, second):
-        return choosing.misfit(HostSurface(first), HostSurface(second), motion)
+        return measuring.misfit(HostSurface(first), HostSurface(second), motion, 0.05)
 
     def spacing(points):
         return np.median(cKDTree(points).query(points, 2)[0][:, 1])
@@ -153,5 +153,5 @@ def test_the_misfit_looks_both_ways_as_a_kd_tree_does():
         ways = loss(first, second, motion, cut), loss(second, first, np.linalg.inv(motion), cut)
         assert told(first, second) == pytest.approx(np.mean(ways), abs=1e-9)
     assert told(part, target) == pytest.approx(
-        choosing.misfit(HostSurface(target), HostSurface(part), np.linalg.inv(motion))
+        measuring.misfit(HostSurface(target), HostSurface(part), np.linalg.inv(motion), 0.05)
     )
