@@ -79,7 +79,8 @@ def keep_start(case: Case, *, refine: Refinement | None, finish: Sequence[Step])
 
     Candidates are the network's answer, the start after `refine` (if JAX can trace it), and the
     start as it is. Each goes through the steps of `finish`; the one with the smallest
-    `measuring.misfit` is the answer, and what is told of it is measured anew if it is not the network's.
+    `measuring.misfit` is the answer. If that is not the network's, what is told of it is measured
+    anew.
     """
     placed_at = [np.eye(4, dtype=np.float32)]
     sides = solving.on_device(case.plan.source, case.plan.target)
