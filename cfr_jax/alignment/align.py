@@ -59,11 +59,11 @@ def align(
     several starts (k, 4, 4), all are tried on thinned clouds, and the one from which the clouds fit
     best is taken. "global" also tries starts that cover all rotations (`search`), and takes what it
     finds where it is clearly better than the answer without them. This takes several times as long,
-    and also reports other motions that fit about as well. "auto" does so only where that answer is
-    not trusted. Without `initial`, a refined answer that is not trusted gets a `second_look`: some
-    starts around the first, and the clouds as they lie, are tried in the same way, and the answer
-    that is more likely right is kept (weights without calibration cannot tell, and get no second
-    look). The same call gives the same answer, bit by bit, on the same machine.
+    and also reports other motions that fit about as well. "auto" does so only where the confidence
+    in that answer is below one half. Without `initial`, a refined answer that is not trusted gets a
+    `second_look`: some starts around the first, and the clouds as they lie, are tried in the same
+    way, and the answer that is more likely right is kept (weights without calibration cannot tell,
+    and get no second look). The same call gives the same answer, bit by bit, on the same machine.
 
     Raises ValueError for clouds without extent or with fewer than 3 points, wrong shapes, values
     that are not finite, and an `initial` that is no rigid motion or leaves the clouds far apart;
