@@ -125,7 +125,7 @@ def tried(
     `starts` of unit clouds.
 
     Motions `beside` them are refined without the network. `as_given` says that the starts are to be
-    respected, too. What is best is told by the fewest misfits of all points (`measuring.misfit`).
+    respected, too. What is best is told by the misfit on all points (`measuring.misfit`).
     """
     plan = case.plan
     at_once = _AT_ONCE if on_accelerator() else 1
@@ -143,11 +143,11 @@ def tried(
     )
     arguments = (case.params, *coarse, jnp.asarray(starts, jnp.float32))
     proposed = timed(case.seconds, propose, *arguments, at_once=at_once, as_given=as_given)
-    motions = proposed.motions
-    if beside is not None and len(beside):
-        motions = jnp.concatenate([motions, jnp.asarray(beside, jnp.float32)])
+    motions = np.asarray(proposed.motions)
+    if beside is not None:
+        motions = np.concatenate([motions, beside.astype(np.float32)])
     whole = on_device(plan.source, plan.target)
-    found = timed(case.seconds, polish, *whole, motions)
+    found = timed(case.seconds, polish, *whole, jnp.asarray(motions))
     began = time.perf_counter()
     unit_motions = np.asarray(found.motions, np.float64)
     case = refining.placed(case)

@@ -155,3 +155,18 @@ def test_the_misfit_looks_both_ways_as_a_kd_tree_does():
     assert told(part, target) == pytest.approx(
         measuring.misfit(HostSurface(target), HostSurface(part), np.linalg.inv(motion), 0.05)
     )
+
+
+def test_of_large_clouds_some_points_are_asked_about_all_of_the_other(monkeypatch):
+    source, target = solids.lopsided(300, 0).points, solids.lopsided(400, 1).points
+    monkeypatch.setattr(measuring, "_ASKED", 100)
+
+    found = measuring.misfit(HostSurface(source), HostSurface(target), np.eye(4), 0.01)
+
+    def loss(some, others):
+        away = cKDTree(others).query(some)[0]
+        return np.mean(1 - np.maximum(1 - (away / 0.01) ** 2, 0) ** 3)
+
+    wanted = (loss(source[::3], target) + loss(target[::4], source)) / 2
+    assert 0.1 < wanted < 1
+    assert found == pytest.approx(wanted, abs=1e-9)
