@@ -18,7 +18,7 @@ def get_config(normals: str = "exact") -> EvaluationConfig:
             "kind": "corpus",
             # from `cfr data open-cad --out data/open_cad`, or any file in the ModelNet40 layout
             "path": "data/open_cad/test.h5",
-            "protocol": "partial",  # or clean, noise, low_overlap, partial_both_ways
+            "protocol": "partial",  # or clean, noise, overlap_1 to overlap_9, ...
         },
         methods={"exact": exact, "estimated": estimated}[normals](),
         limit=300,

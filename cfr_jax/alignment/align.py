@@ -16,7 +16,7 @@ from cfr_jax.alignment.case import Case
 from cfr_jax.alignment.planning import Plan, planned
 from cfr_jax.alignment.refining import refine_every_point, refine_used_points
 from cfr_jax.alignment.search import search
-from cfr_jax.alignment.second_look import look_again
+from cfr_jax.alignment.second_look import keep_start, look_again, look_everywhere
 from cfr_jax.alignment.solving import on_accelerator, solve_case
 from cfr_jax.networks.cfr.network import check_params
 from cfr_jax.networks.probability import calibration_of
@@ -33,7 +33,7 @@ def align(
     refine: bool | str = True,
     initial: Float[np.ndarray, "4 4"]
     | Float[np.ndarray, "k 4 4"]
-    | Literal["global"]
+    | Literal["global", "auto"]
     | None = None,
     max_points: int | None = None,
     all_points: bool = True,
@@ -53,14 +53,17 @@ def align(
     makes the score worse.
 
     `initial` (4, 4) moves the source close to the target first. Without it, the centroids are laid
-    on each other. The network is trained for up to 45 degrees about each axis from there. If there
-    are several starts (k, 4, 4), all are tried on thinned clouds, and the one from which the clouds
-    fit best is taken. "global" tries starts that cover all rotations (`search`). This takes several
-    times as long, and also reports other motions that fit about as well. Without `initial`, a
-    refined answer that is not trusted gets a `second_look`: some starts around the first are tried
-    in the same way, and the answer that is more likely right is kept (weights without calibration
-    cannot tell, and get no second look). The same call gives the same answer, bit by bit, on the
-    same machine.
+    on each other. The network is trained for up to 45 degrees about each axis from there. A given
+    start is also refined as it is, and its answer is kept where the clouds then lie better on each
+    other than after the network, told by all points both ways (`measuring.misfit`). If there are
+    several starts (k, 4, 4), all are tried on thinned clouds, and the one from which the clouds fit
+    best is taken. "global" also tries starts that cover all rotations (`search`), and takes what it
+    finds where it is clearly better than the answer without them. This takes several times as long,
+    and also reports other motions that fit about as well. "auto" does so only where the confidence
+    in that answer is below one half. Without `initial`, a refined answer that is not trusted gets a
+    `second_look`: some starts around the first, and the clouds as they lie, are tried in the same
+    way, and the answer that is more likely right is kept (weights without calibration cannot tell,
+    and get no second look). The same call gives the same answer, bit by bit, on the same machine.
 
     Raises ValueError for clouds without extent or with fewer than 3 points, wrong shapes, values
     that are not finite, and an `initial` that is no rigid motion or leaves the clouds far apart;
@@ -105,13 +108,30 @@ def steps(
     plan: Plan, refinements: tuple[Refinement, ...], *, second_look: bool
 ) -> Iterator[Callable[[Case], Case]]:
     """The steps from a plan to its answer; each takes the case as the step before left it."""
-    traced = refinements[0] if refinements and refinements[0].traceable else None
-    if plan.starts is not None:
+    if plan.starts is not None and plan.start_given:
         yield search
-    yield functools.partial(solve_case, refine=traced)
-    if second_look and traced is not None and plan.starts is None:
+    yield functools.partial(solve_case, refine=_traced(refinements))
+    yield from after_network(plan, refinements, second_look=second_look)
+
+
+def after_network(
+    plan: Plan, refinements: tuple[Refinement, ...], *, second_look: bool
+) -> Iterator[Callable[[Case], Case]]:
+    """The steps from what the network found for a plan to its answer."""
+    traced, last = _traced(refinements), tuple(on_host(plan, refinements))
+    if second_look and traced is not None:
         yield functools.partial(look_again, refine=traced)
-    yield from on_host(plan, refinements)
+    if plan.starts is not None and not plan.start_given:
+        yield functools.partial(look_everywhere, plan=plan, refine=traced, finish=last)
+    elif plan.start_given and refinements:
+        yield functools.partial(keep_start, refine=traced, finish=last)
+    else:
+        yield from last
+
+
+def _traced(refinements: tuple[Refinement, ...]) -> Refinement | None:
+    """What is part of the network's program."""
+    return refinements[0] if refinements and refinements[0].traceable else None
 
 
 def on_host(plan: Plan, refinements: tuple[Refinement, ...]) -> Iterator[Callable[[Case], Case]]:

@@ -13,6 +13,7 @@ from cfr_jax.alignment import confidence, quality
 from cfr_jax.alignment.planning import Plan
 from cfr_jax.geometry import units
 from cfr_jax.networks.cfr.registration import Registration
+from cfr_jax.refine.surfaces import HostSurface
 
 
 @struct.dataclass
@@ -32,19 +33,28 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What a search found; motions map source onto target, the best first."""
+    """What a search found; motions map source onto target, the one with the least misfit first."""
 
     unit_motions: Float[np.ndarray, "k 4 4"]
     """Of the unit clouds of the plan."""
     motions: Float[np.ndarray, "k 4 4"]
     """Of the caller's clouds."""
     fits: Float[np.ndarray, " k"]
-    """`quality.mutual_fit` of each, on the full clouds; never rising."""
+    """`quality.mutual_fit` of each, on the points that the network sees."""
     frames: units.Frames
     starts: int
     """How many were tried."""
     nearby: bool = False
     """Whether only starts around where the source lay were."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Both clouds on the host, in the unit sphere of `frames`, and their trees."""
+
+    source: HostSurface
+    target: HostSurface
+    frames: units.Frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +67,9 @@ class Case:
     """The answer so far, of the plan's unit clouds."""
     searched: Search | None = None
     """The last search for a better start, if there was one."""
+    placed: Placed | None = None
+    """All points of the clouds, or those that the network saw where the plan has no others; None
+    until they are asked for. It stays when the source is started elsewhere."""
     seconds: dict[str, float] = field(default_factory=lambda: {"compile": 0.0, "run": 0.0})
     """What all steps together took; each adds its own."""
 

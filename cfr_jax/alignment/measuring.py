@@ -1,4 +1,4 @@
-"""The quality of a motion on all points of the clouds, measured on the host by KD-trees."""
+"""The quality of motions on all points of the clouds, measured on the host by KD-trees."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ import numpy as np
 from flax import struct
 from jaxtyping import Float
 
+from cfr_jax.geometry import motions
+from cfr_jax.refine import all_points
 from cfr_jax.refine.surfaces import HostSurface, closest
+
+_ASKED = 1 << 15  # points whose distances are enough to tell motions apart
+_SPACINGS = 2.0  # points of one surface are about half the spacing away from each other
 
 
 @struct.dataclass
@@ -35,3 +40,25 @@ def measure(
         overlap=np.asarray(np.mean(away <= 2 * target.tree.spacing)),
         moments=partners.T @ partners,
     )
+
+
+def misfit(
+    source: HostSurface, target: HostSurface, transform: Float[np.ndarray, "4 4"], distance: float
+) -> float:
+    """How badly two clouds lie on each other under `transform` (source onto target), in [0, 1].
+
+    The mean of two losses: of the source's points to the target and of the target's points to the
+    source, each `all_points.score`, cut at twice the wider spacing of the two clouds, and at
+    `distance` at the most. One way alone, a small part lies well on any dense part of a large
+    cloud. Of clouds of more than `_ASKED` points only every second, third, ... one is asked.
+    """
+    cut = min(distance, _SPACINGS * max(source.tree.spacing, target.tree.spacing))
+    ways = (source, target, transform), (target, source, motions.inverse(transform))
+    return sum(
+        all_points.score(to.tree.closest(motions.apply(motion, _asked(cloud)))[1], cut)
+        for cloud, to, motion in ways
+    ) / len(ways)
+
+
+def _asked(cloud: HostSurface) -> Float[np.ndarray, "n 3"]:
+    return cloud.points[:: -(-len(cloud.points) // _ASKED)]

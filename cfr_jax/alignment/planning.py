@@ -21,7 +21,7 @@ SETTINGS = Settings()
 CASCADES = 2  # chosen on validation pairs (docs/training.md)
 
 
-Initial = Float[np.ndarray, "4 4"] | Float[np.ndarray, "k 4 4"] | Literal["global"] | None
+Initial = Float[np.ndarray, "4 4"] | Float[np.ndarray, "k 4 4"] | Literal["global", "auto"] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +34,8 @@ class Plan:
     seed: int = 0
     start_given: bool = False
     """Whether somebody said where the source starts; else centroid lies on centroid."""
+    if_doubted: bool = False
+    """Whether `starts` are tried only where the answer from the one start is not trusted."""
     starts: Float[np.ndarray, "s 4 4"] | None = None
     """Motions of unit clouds to start from, of which a search takes the best; None where the one
     start that there is has been made part of `frames`."""
@@ -91,7 +93,7 @@ def planned(
     neighbors to the device. `to_unit` may stand in for `units.to_unit`, and remember what it made.
     """
     source, target = read_clouds(source, target)
-    everywhere = isinstance(initial, str) and initial == "global"
+    everywhere = isinstance(initial, str) and initial in ("global", "auto")
     given = None if initial is None or everywhere else rigid_motions(initial)
     start = given[0] if given is not None and len(given) == 1 else None
     budget = DEFAULT_BUDGET
@@ -126,7 +128,8 @@ def planned(
         unit_source,
         unit_target,
         seed,
-        start_given=start is not None,
+        start_given=given is not None,
+        if_doubted=everywhere and initial == "auto",
         starts=several,
         whole=(source, target) if whole else None,
     )
@@ -150,7 +153,7 @@ def rigid_motions(initial: Any) -> Float[np.ndarray, "k 4 4"]:
         what = repr(initial) if isinstance(initial, str) else f"a {type(initial).__name__}"
         raise ValueError(
             f"initial: got {what} that is no array of numbers, "
-            'wanted "global", a (4, 4) matrix, or several as (k, 4, 4)'
+            'wanted "global", "auto", a (4, 4) matrix, or several as (k, 4, 4)'
         ) from None
     if given.ndim not in (2, 3) or given.shape[-2:] != (4, 4) or not given.size:
         raise ValueError(f"initial: got shape {given.shape}, wanted (4, 4) or (k, 4, 4)")

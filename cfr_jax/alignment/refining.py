@@ -7,9 +7,10 @@ import time
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from cfr_jax.alignment import measuring, solving
-from cfr_jax.alignment.case import Case
+from cfr_jax.alignment.case import Case, Placed
 from cfr_jax.alignment.planning import Plan
 from cfr_jax.geometry import motions
 from cfr_jax.geometry.units import UnitCloud
@@ -40,20 +41,69 @@ def refine_every_point(case: Case, *, refine: Refinement) -> Case:
     the network saw: it depends on how dense a cloud is.
     """
     began = time.perf_counter()
-    found, surfaces = case.solved(), every_point(case.plan)
-    fit = refine(*surfaces, np.asarray(found.transform, np.float64))
-    transform = np.asarray(fit.transform, np.float64)
-    measured = measuring.measure(*surfaces, transform, solving.DISTANCE)
+    case = placed(case)
+    found = case.solved()
+    fit = refine(*surfaces(case), to_placed(case, np.asarray(found.transform)))
+    transform = _of_plan(case, np.asarray(fit.transform, np.float64))
     found = dataclasses.replace(
         found,
         transform=transform,
         improved=found.improved | np.asarray(fit.improved),
         converged=np.asarray(fit.converged),
         steps=found.steps + np.asarray(fit.steps, np.int32),
-        quality=dataclasses.replace(found.quality, **vars(measured)),
     )
+    case = measured(dataclasses.replace(case, found=found))
     case.seconds["run"] += time.perf_counter() - began
-    return dataclasses.replace(case, found=found)
+    return case
+
+
+def measured(case: Case) -> Case:
+    """The case with the quality of its motion on the clouds that are `placed`."""
+    found = case.solved()
+    transform = to_placed(case, np.asarray(found.transform))
+    told = measuring.measure(*surfaces(case), transform, solving.DISTANCE)
+    quality = dataclasses.replace(found.quality, **vars(told))
+    return dataclasses.replace(case, found=dataclasses.replace(found, quality=quality))
+
+
+def misfit(case: Case, transform: Float[np.ndarray, "4 4"] | None = None) -> float:
+    """`measuring.misfit` of the answer of a `placed` case, or of another motion of its unit
+    clouds."""
+    if transform is None:
+        transform = np.asarray(case.solved().transform)
+    return measuring.misfit(*surfaces(case), to_placed(case, transform), solving.DISTANCE)
+
+
+def placed(case: Case) -> Case:
+    """The case with its clouds on the host: made once, and kept for other starts of this pair."""
+    if case.placed is not None:
+        return case
+    plan = case.plan
+    sides = (_used(plan.source), _used(plan.target)) if plan.whole is None else every_point(plan)
+    return dataclasses.replace(case, placed=Placed(*sides, plan.frames))
+
+
+def surfaces(case: Case) -> tuple[HostSurface, HostSurface]:
+    """Source and target of a `placed` case."""
+    assert case.placed is not None
+    return case.placed.source, case.placed.target
+
+
+def to_placed(case: Case, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """A motion between the plan's unit clouds as one between the clouds that are `placed`."""
+    assert case.placed is not None
+    transform = np.asarray(transform, np.float64)
+    if case.placed.frames is case.plan.frames:
+        return transform
+    return case.placed.frames.to_unit(case.plan.frames.to_caller(transform))
+
+
+def _of_plan(case: Case, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """A motion between the clouds that are `placed` as one of the plan's unit clouds."""
+    assert case.placed is not None
+    if case.placed.frames is case.plan.frames:
+        return transform
+    return case.plan.frames.to_unit(case.placed.frames.to_caller(transform))
 
 
 def _used(unit: UnitCloud) -> HostSurface:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import time
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +18,11 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Float
 
-from cfr_jax.alignment import planning, quality
+from cfr_jax.alignment import planning, quality, refining
 from cfr_jax.alignment.case import Case, Search
 from cfr_jax.alignment.solving import DeviceCloud, on_accelerator, on_device, surface, timed
 from cfr_jax.geometry import rigid, units
+from cfr_jax.geometry.motions import angle_between
 from cfr_jax.networks.cfr.registration import encode, register
 from cfr_jax.networks.inputs import Settings, moved_by
 from cfr_jax.networks.record import Params
@@ -35,13 +37,14 @@ _AT_ONCE = 32  # starts vectorized together by accelerators; one by one they sta
 _SAME_TURN = 20.0  # degrees
 _SAME_PLACE = 0.2
 RIVAL = 0.95  # of the best fit: so near, the shapes alone do not say which is right
+_FEW = 8  # starts that are refined in full
 _COARSE_REACH = 0.1
 _FULL_REACH = generalized_icp.CUT
 
 
 @struct.dataclass
 class Candidates:
-    """Motions of the source onto the target, the best first, and how well each fits."""
+    """Motions of the source onto the target, and how well each fits."""
 
     motions: Float[Array, "k 4 4"]
     fits: Float[Array, " k"]
@@ -50,7 +53,7 @@ class Candidates:
 programs.storable(Candidates)
 
 
-@functools.partial(jax.jit, static_argnames=("kept", "at_once"))
+@functools.partial(jax.jit, static_argnames=("kept", "at_once", "as_given"))
 def propose(
     params: Params,
     source: DeviceCloud,
@@ -59,11 +62,13 @@ def propose(
     *,
     kept: int = KEPT,
     at_once: int = 1,
+    as_given: bool = False,
 ) -> Candidates:
     """Where the network ends on coarse clouds from each start: the `kept` that fit best and differ.
 
     `at_once` starts go through the network together (`vmap`); the target is encoded once. Where
-    fewer than `kept` differ, the rest have a fit of -1.
+    starts are to be respected `as_given`, each is also refined without the network. Where fewer
+    than `kept` differ, the rest have a fit of -1.
     """
     sides = source.prepared(COARSE), target.prepared(COARSE)
     encoded = encode(params, sides[1], settings=COARSE)
@@ -71,36 +76,57 @@ def propose(
 
     def end(start: Array) -> tuple[Array, Array]:
         found = register(params, moved_by(start, sides[0]), encoded, settings=COARSE)
-        motion = rigid.compose(found.transform, start)
-        return motion, quality.mutual_fit(*surfaces, motion, _COARSE_REACH)
+        ends = [rigid.compose(found.transform, start)]
+        if as_given:
+            ends.append(jnp.asarray(generalized_icp.refine(*surfaces, start).transform))
+        fits = [quality.mutual_fit(*surfaces, motion, _COARSE_REACH) for motion in ends]
+        return jnp.stack(ends), jnp.stack(fits)
 
     motions, fits = lax.map(end, starts, batch_size=at_once if at_once > 1 else None)
-    return _distinct(motions, fits, kept)
+    return _distinct(motions.reshape(-1, 4, 4), fits.ravel(), kept)
 
 
 @jax.jit
 def polish(source: DeviceCloud, target: DeviceCloud, found: Float[Array, "k 4 4"]) -> Candidates:
-    """Refines each motion on the full clouds, and puts what fits best first."""
+    """Refines each motion on the full clouds, and tells how well it fits."""
     first, second = (surface(cloud.prepared(planning.SETTINGS)) for cloud in (source, target))
 
     def refine(motion: Array) -> tuple[Array, Array]:
         refined = jnp.asarray(generalized_icp.refine(first, second, motion).transform)
         return refined, quality.mutual_fit(first, second, refined, _FULL_REACH)
 
-    motions, fits = lax.map(refine, found)
-    return _distinct(motions, fits, len(found))
+    return Candidates(*lax.map(refine, found))
 
 
 def search(case: Case) -> Case:
-    """The plan started where its source comes to lie best on its target, of all `plan.starts`."""
+    """The plan started where its source comes to lie best on its target, of all starts given."""
     assert case.plan.starts is not None
-    searched = tried(case, case.plan.starts)
-    plan = case.plan.started_at(searched.unit_motions[0])
-    return dataclasses.replace(case, plan=plan, searched=searched)
+    starts = case.plan.starts
+    few = starts if len(starts) <= _FEW else None
+    return started(tried(case, starts, beside=few, as_given=True))
 
 
-def tried(case: Case, starts: Float[np.ndarray, "s 4 4"], *, nearby: bool = False) -> Search:
-    """The best motions of the case's source onto its target from all `starts` of unit clouds."""
+def started(case: Case) -> Case:
+    """The case at the best motion that was just `tried`."""
+    assert case.searched is not None
+    plan = case.plan.started_at(case.searched.unit_motions[0])
+    return dataclasses.replace(case, plan=plan)
+
+
+def tried(
+    case: Case,
+    starts: Float[np.ndarray, "s 4 4"],
+    *,
+    beside: Float[np.ndarray, "b 4 4"] | None = None,
+    nearby: bool = False,
+    as_given: bool = False,
+) -> Case:
+    """The case with what was `searched`: the best motions of its source onto its target, from all
+    `starts` of unit clouds.
+
+    Motions `beside` them are refined without the network. `as_given` says that the starts are to be
+    respected, too. What is best is told by the misfit on all points (`measuring.misfit`).
+    """
     plan = case.plan
     at_once = _AT_ONCE if on_accelerator() else 1
     coarse = on_device(
@@ -116,33 +142,50 @@ def tried(case: Case, starts: Float[np.ndarray, "s 4 4"], *, nearby: bool = Fals
         )
     )
     arguments = (case.params, *coarse, jnp.asarray(starts, jnp.float32))
-    proposed = timed(case.seconds, propose, *arguments, at_once=at_once)
+    proposed = timed(case.seconds, propose, *arguments, at_once=at_once, as_given=as_given)
+    motions = np.asarray(proposed.motions)
+    if beside is not None:
+        motions = np.concatenate([motions, beside.astype(np.float32)])
     whole = on_device(plan.source, plan.target)
-    found = timed(case.seconds, polish, *whole, proposed.motions)
-    real = np.asarray(found.fits) >= 0
-    unit_motions = np.asarray(found.motions, np.float64)[real]
-    return Search(
-        unit_motions=unit_motions,
-        motions=plan.frames.to_caller(unit_motions),
-        fits=np.asarray(found.fits, np.float64)[real],
+    found = timed(case.seconds, polish, *whole, jnp.asarray(motions))
+    began = time.perf_counter()
+    unit_motions = np.asarray(found.motions, np.float64)
+    case = refining.placed(case)
+    misfits = [refining.misfit(case, motion) for motion in unit_motions]
+    order: list[int] = []
+    for row in np.argsort(misfits, kind="stable"):
+        if not any(_near(unit_motions[row], unit_motions[kept]) for kept in order):
+            order.append(row)
+    case.seconds["run"] += time.perf_counter() - began
+    searched = Search(
+        unit_motions=unit_motions[order],
+        motions=plan.frames.to_caller(unit_motions[order]),
+        fits=np.asarray(found.fits, np.float64)[order],
         frames=plan.frames,
         starts=len(starts),
         nearby=nearby,
     )
+    return dataclasses.replace(case, searched=searched)
 
 
 def rivals(searched: Search, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "a 4 4"]:
     """Motions that differ from `transform` and fit about as well as the best."""
     frames, fits = searched.frames, searched.fits
     unit, mine = frames.to_unit(searched.motions), frames.to_unit(transform)
-    near = np.array([bool(same(*jnp.array([mine, other], jnp.float32))) for other in unit])
-    return searched.motions[(fits >= RIVAL * fits[0]) & ~near]
+    near = np.array([_near(mine, other) for other in unit])
+    return searched.motions[(fits >= RIVAL * fits.max()) & ~near]
 
 
 def same(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Array:
     """Whether two motions of unit clouds are too close to count as different answers."""
     away = jnp.linalg.norm(first[:3, 3] - second[:3, 3])
     return (rigid.rotation_error(first, second) < _SAME_TURN) & (away < _SAME_PLACE)
+
+
+def _near(first: np.ndarray, second: np.ndarray) -> bool:
+    """`same`, on the host."""
+    away = np.linalg.norm(first[:3, 3] - second[:3, 3])
+    return bool(angle_between(first, second) < _SAME_TURN and away < _SAME_PLACE)
 
 
 def _distinct(motions: Array, fits: Array, kept: int) -> Candidates:

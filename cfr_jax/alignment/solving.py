@@ -104,6 +104,15 @@ def replaced(
     return Found(found.registration, transform, improved, converged, steps, measured, clues)
 
 
+@jax.jit
+def judged(source: DeviceCloud, target: DeviceCloud, found: Found) -> Found:
+    """`found` with the quality and the clues of its transform, which somebody put there."""
+    cloud = target.prepared()
+    surfaces = surface(source.prepared()), surface(cloud)
+    measured, clues = _judge(found.registration, jnp.asarray(found.transform), cloud, surfaces)
+    return dataclasses.replace(found, quality=measured, clues=clues)
+
+
 def _judge(
     registration: Registration, transform: Array, target: Cloud, surfaces: tuple[Surface, Surface]
 ) -> tuple[quality.Quality, confidence.Clues]:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from cfr_jax.geometry import motions, units
 
+_MEETING = 1.5  # radii between the centers; two unit balls touch at two
 COUNT = 128  # no rotation is farther than 46 degrees from one of them, and most within 24
 
 
@@ -24,6 +25,13 @@ def around() -> Float[np.ndarray, "s 4 4"]:
     between = np.array(list(itertools.product((1, -1), repeat=3))) / np.sqrt(3)
     turns = np.concatenate([np.zeros((1, 3)), 40 * axes, 50 * between])
     return motions.motion(motions.from_rotvec(np.radians(turns)))
+
+
+def as_they_lie(frames: units.Frames) -> Float[np.ndarray, "s 4 4"]:
+    """The caller's clouds just as they come, as a start of unit clouds: scans of one scene often
+    share a frame. None where the clouds then lie too far from each other to meet."""
+    unit = frames.to_unit(np.eye(4))[None]
+    return unit[np.linalg.norm(unit[:, :3, 3], axis=1) <= _MEETING]
 
 
 def given(frames: units.Frames, starts: Float[np.ndarray, "s 4 4"]) -> Float[np.ndarray, "s 4 4"]:

@@ -13,11 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from cfr_jax.alignment import solving
-from cfr_jax.alignment.align import on_host
+from cfr_jax.alignment.align import after_network
 from cfr_jax.alignment.answers import Alignment, answer
 from cfr_jax.alignment.case import Case, Found
 from cfr_jax.alignment.planning import SETTINGS, Plan
-from cfr_jax.alignment.second_look import look_again
 from cfr_jax.batch.memo import Memo
 from cfr_jax.geometry.units import UnitCloud
 from cfr_jax.networks.cfr.iterations import Encoded
@@ -41,7 +40,7 @@ class Device:
         self._params, self._refinements = params, refinements
         self.size: int = size
         self._refine = refinements[0] if refinements else None
-        self._second_look = self._refine is not None and second_look
+        self._second_look = second_look
         self._encoded = Memo(_KEPT)
 
     def solve(self, plans: Sequence[Plan]) -> list[Alignment]:
@@ -74,15 +73,11 @@ class Device:
         ]
 
     def _answer(self, plan: Plan, found: Found, seconds: dict[str, float]) -> Alignment:
-        """The answer, after a second look if it is in doubt, and the refinements on the host.
-
-        Both take one pair at a time.
-        """
+        """The answer, after what takes one pair at a time: a second look if it is in doubt, a
+        start that was given, and the refinements on the host."""
         case = Case(self._params, plan, found, seconds=dict(seconds))
         began = time.perf_counter()
-        if self._second_look:
-            case = look_again(case, refine=self._refine)
-        for step in on_host(case.plan, self._refinements):
+        for step in after_network(plan, self._refinements, second_look=self._second_look):
             case = step(case)
         case.seconds["total"] += time.perf_counter() - began
         return answer(case)

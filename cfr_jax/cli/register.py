@@ -124,6 +124,11 @@ def add_parser(commands: Commands) -> None:
         action="store_true",
         help="search all rotations; without it, up to about 45 degrees about each axis are found",
     )
+    where.add_argument(
+        "--auto",
+        action="store_true",
+        help="search all rotations only if the answer is not trusted without",
+    )
     how.add_argument(
         "--max-points",
         metavar="N",
@@ -169,7 +174,7 @@ def run(args: argparse.Namespace) -> int:
     from cfr_jax import io
     from cfr_jax.cli.shared.transforms import read_transform
 
-    initial: Any = "global" if args.everywhere else None
+    initial: Any = "global" if args.everywhere else "auto" if args.auto else None
     if args.initial is not None:
         motions = [read_transform(path) for path in args.initial]
         initial = motions[0] if len(motions) == 1 else np.stack(motions)

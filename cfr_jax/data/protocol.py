@@ -40,12 +40,20 @@ class Protocol:
     angle: float | None = 45.0  # degrees; each Euler angle from [0, angle]; None: any rotation
     both_ways: bool = False  # each angle from [-angle, angle] instead, as in users' clouds
     translation: float = 0.5  # each coordinate is drawn from [-translation, translation]
+    # share of each cropped cloud that the other has, too: both are cut across one direction, from
+    # opposite ends, where `keep` draws a direction for each
+    overlap: float | None = None
 
     def __post_init__(self) -> None:
         if self.points < 1:
             raise ValueError(f"points: got {self.points}, wanted at least 1")
         if self.keep is not None and not 0 < self.keep < 1:
             raise ValueError(f"keep: got {self.keep}, wanted None or a share between 0 and 1")
+        if self.overlap is not None and (self.keep is not None or not 0 < self.overlap < 1):
+            raise ValueError(
+                f"overlap: got {self.overlap} with keep {self.keep}, wanted None or a share "
+                "between 0 and 1, and no keep"
+            )
 
 
 clean: Final = Protocol("clean", noise=False)
@@ -54,9 +62,15 @@ partial: Final = Protocol("partial", keep=0.7)
 low_overlap: Final = Protocol("low_overlap", keep=0.5)
 partial_both_ways: Final = Protocol("partial_both_ways", keep=0.7, both_ways=True)
 partial_any_rotation: Final = Protocol("partial_any_rotation", keep=0.7, angle=None)
+by_overlap: Final = tuple(
+    Protocol(f"overlap_{tenths}", overlap=tenths / 10, both_ways=True) for tenths in range(1, 10)
+)
 PROTOCOLS = {
     made.name: made
-    for made in (clean, noise, partial, low_overlap, partial_both_ways, partial_any_rotation)
+    for made in (
+        *(clean, noise, partial, low_overlap, partial_both_ways, partial_any_rotation),
+        *by_overlap,
+    )
 }
 
 
@@ -116,12 +130,7 @@ def crop(points: Float[np.ndarray, "p 3"], keep: float, rng: Rng) -> Int[np.ndar
     For exactly one half the plane goes through the mean, as in the published low-overlap sets, so
     the share is only roughly one half. Raises ValueError if no point is left.
     """
-    azimuth = rng.uniform(0.0, 2 * np.pi)
-    polar = np.arccos(rng.uniform(-1.0, 1.0))
-    direction = np.array(
-        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
-    )
-    height = (points - points.mean(axis=0)) @ direction
+    height = (points - points.mean(axis=0)) @ _direction(rng)
     # The published share is a float32, so in float64 (1 - 0.7) * 100 is not quite 30.
     percentile = (1.0 - float(np.float32(keep))) * 100
     plane = 0.0 if keep == 0.5 else np.percentile(height, percentile)
@@ -132,6 +141,26 @@ def crop(points: Float[np.ndarray, "p 3"], keep: float, rng: Rng) -> Int[np.ndar
             "points do not coincide"
         )
     return kept
+
+
+def opposite_sides(
+    points: Float[np.ndarray, "p 3"], overlap: float, rng: Rng
+) -> tuple[Int[np.ndarray, " kept"], Int[np.ndarray, " kept"]]:
+    """Rows of two crops from the two ends of one random direction, which share `overlap` of each.
+
+    Each keeps 1 / (2 - overlap) of the points, so that together they are the whole shape.
+    """
+    order = np.argsort(points @ _direction(rng), kind="stable")
+    kept = round(len(points) / (2 - overlap))
+    return np.sort(order[:kept]), np.sort(order[len(points) - kept :])
+
+
+def _direction(rng: Rng) -> Float[np.ndarray, " 3"]:
+    azimuth = rng.uniform(0.0, 2 * np.pi)
+    polar = np.arccos(rng.uniform(-1.0, 1.0))
+    return np.array(
+        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
+    )
 
 
 def random_motion(
@@ -182,18 +211,20 @@ def _make_pair(
     shared: Callable[[Rng], Int[np.ndarray, " n"]],
 ) -> Pair:
     """Applies the operations in their published order: source first, except in the shuffle."""
-    if protocol.keep is None and not protocol.noise:
+    if protocol.keep is None and protocol.overlap is None and not protocol.noise:
         chosen = shared(reseed())
         points, normals = points[chosen], normals[chosen]
     source_rows = target_rows = np.arange(len(points))
-    overlap = 1.0
     count = protocol.points
     if protocol.keep is not None:
         rng = reseed()
         source_rows = crop(points, protocol.keep, rng)
         target_rows = crop(points, protocol.keep, rng)
-        overlap = len(np.intersect1d(source_rows, target_rows)) / len(source_rows)
         count = math.ceil(np.float32(protocol.keep) * count)
+    elif protocol.overlap is not None:
+        source_rows, target_rows = opposite_sides(points, protocol.overlap, reseed())
+        count = math.ceil(count / (2 - protocol.overlap))
+    overlap = len(np.intersect1d(source_rows, target_rows)) / len(source_rows)
 
     rng = reseed()
     motion = random_motion(protocol.angle, protocol.translation, rng, both_ways=protocol.both_ways)
@@ -202,7 +233,7 @@ def _make_pair(
     source_normals = motions.rotate(motion, normals[source_rows])
     target, target_normals = points[target_rows], normals[target_rows]
 
-    if protocol.keep is not None or protocol.noise:
+    if protocol.keep is not None or protocol.overlap is not None or protocol.noise:
         rng = reseed()
         chosen = resample(len(source), count, rng)
         source, source_normals = source[chosen], source_normals[chosen]

@@ -9,10 +9,11 @@ import pytest
 import solids
 from scipy.spatial import cKDTree
 
-from cfr_jax.alignment import doubts, quality, search, starts
+from cfr_jax.alignment import doubts, quality, search, second_look, starts
 from cfr_jax.alignment.align import align
 from cfr_jax.alignment.case import Search
-from cfr_jax.geometry.units import Frames
+from cfr_jax.geometry.units import Frames, unit_frames
+from cfr_jax.io import PointCloud
 from cfr_jax.refine.surfaces import Surface
 
 FIT = jax.jit(functools.partial(quality.mutual_fit, reach=0.2))
@@ -45,6 +46,49 @@ def test_a_turn_of_any_size_is_found(few_starts, degrees):
         < 0.05
     )
     assert found.seconds["run"] > 0 and found.determined
+
+
+def test_an_answer_without_a_search_stands_unless_it_is_clearly_beaten(few_starts, monkeypatch):
+    source, target = solids.two_samplings(256, solids.motion(20))
+    plain = align(source, target)
+
+    searched = align(source, target, initial="global", max_points=256)
+    beaten = np.array([True])
+    monkeypatch.setattr(second_look, "clearly_better", lambda other, case: beaten.all())
+    other = align(source, target, initial="global", max_points=256)
+
+    np.testing.assert_allclose(searched.transform, plain.transform, atol=1e-6)
+    assert searched.confidence == pytest.approx(plain.confidence, abs=1e-3)
+    assert searched.starts > starts.COUNT - 1 and searched.initial is None
+    assert other.initial is not None
+
+
+def test_what_is_not_trusted_is_searched_for_and_what_is_trusted_is_not(few_starts, monkeypatch):
+    truth = solids.motion(150, (1, -1, 0.5))
+    monkeypatch.setattr(starts, "around", lambda: np.eye(4)[None])  # no help from a second look
+    easy = solids.two_samplings(256, solids.motion(20))
+    hard = solids.two_samplings(256, truth)
+
+    (at_once, alone), (far, once) = (
+        (align(*pair, initial="auto", max_points=256), align(*pair)) for pair in (easy, hard)
+    )
+
+    assert at_once.starts == 1
+    np.testing.assert_array_equal(at_once.transform, alone.transform)
+    assert not once.trusted and solids.degrees_between(once.transform, truth) > 20
+    assert far.starts == starts.COUNT and solids.degrees_between(far.transform, truth) < 3
+
+
+def test_clouds_as_they_lie_are_a_start_where_they_meet():
+    source = solids.lopsided(64, 0).points
+    near, far = (source + [shift, 0.0, 0.0] for shift in (0.5, 5.0))
+    frames = [unit_frames(PointCloud(source), PointCloud(target), None) for target in (near, far)]
+
+    (found,) = starts.as_they_lie(frames[0])
+
+    np.testing.assert_allclose(frames[0].to_caller(found), np.eye(4), atol=1e-9)
+    assert np.linalg.norm(found[:3, 3]) > 0.5
+    assert not len(starts.as_they_lie(frames[1]))
 
 
 def test_of_several_starts_the_one_near_the_truth_is_taken(few_starts):

@@ -1,5 +1,7 @@
 """A second look at answers in doubt: when it is taken, and that it is never worse."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import solids
@@ -65,9 +67,10 @@ def test_what_is_less_likely_right_is_not_taken(pair, monkeypatch):
     half = np.array([np.diag([1.0, -1.0, -1.0, 1.0])])
     asked = []
 
-    def worse(case, starts, nearby):
+    def worse(case, starts, beside, nearby):
         asked.append(len(starts))
-        return Search(half, half, np.ones(1), case.plan.frames, len(starts), nearby)
+        found = Search(half, half, np.ones(1), case.plan.frames, len(starts), nearby)
+        return dataclasses.replace(case, searched=found)
 
     monkeypatch.setattr(search, "tried", worse)
     monkeypatch.setattr(doubts, "TRUSTED", 2.0)

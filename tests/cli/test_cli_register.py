@@ -220,8 +220,17 @@ def test_a_global_search_tells_its_start_and_the_other_answers(pair, answering, 
     np.testing.assert_array_equal(document["initial"], cli_samples.motion(90.0))
 
 
-def test_a_start_and_a_search_are_not_asked_for_together(pair, capsys):
-    code = main(["register", *pair, "--global", "--initial", "a.txt"])
+def test_a_search_may_wait_for_an_answer_in_doubt(pair, answering):
+    calls = answering()
+
+    code = main(["register", *pair, "--auto"])
+
+    assert code == 0 and calls[0]["initial"] == "auto"
+
+
+@pytest.mark.parametrize("searching", ["--global", "--auto"])
+def test_a_start_and_a_search_are_not_asked_for_together(pair, capsys, searching):
+    code = main(["register", *pair, searching, "--initial", "a.txt"])
 
     assert code == 2
     assert "not allowed with argument" in capsys.readouterr().err

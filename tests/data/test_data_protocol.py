@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from cfr_jax.data import protocol as protocols
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.protocol import Protocol, fixed_pair, random_pair
+from cfr_jax.geometry import motions
 
 NAMED = [protocols.clean, protocols.noise, protocols.partial, protocols.low_overlap]
 
@@ -206,3 +207,34 @@ def test_impossible_requests_are_refused_by_name():
         fixed_pair(corpus_of(), 9, protocols.clean)
     with pytest.raises(ValueError, match="leaves none of 8 points"):
         protocols.crop(np.zeros((8, 3), np.float32), 0.7, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("overlap", [0.1, 0.5, 0.9])
+def test_two_ends_of_a_shape_share_what_they_should_and_are_the_whole(overlap):
+    points = np.random.default_rng(3).normal(size=(1000, 3)) + [5.0, 0.0, 0.0]
+
+    first, second = protocols.opposite_sides(points, overlap, np.random.default_rng(0))
+
+    both = np.intersect1d(first, second)
+    assert len(first) == len(second)
+    assert len(both) / len(first) == pytest.approx(overlap, abs=0.003)
+    assert len(np.union1d(first, second)) == len(points)
+    # cut across one direction: it tells the three parts apart
+    only_first, only_second = np.setdiff1d(first, both), np.setdiff1d(second, both)
+    along = points[only_second].mean(axis=0) - points[only_first].mean(axis=0)
+    assert (points[only_first] @ along).mean() < (points[both] @ along).mean()
+    assert (points[both] @ along).mean() < (points[only_second] @ along).mean()
+
+
+def test_a_pair_of_given_overlap_has_it_and_lies_by_its_truth():
+    corpus = corpus_of()
+
+    pair = fixed_pair(corpus, 1, protocols.PROTOCOLS["overlap_3"])
+
+    assert pair.overlap == pytest.approx(0.3, abs=0.003)
+    assert len(pair.source) == len(pair.target) == math.ceil(1024 / 1.7)
+    np.testing.assert_allclose(
+        motions.apply(pair.transform, pair.clean_source), pair.clean_target, atol=1e-5
+    )
+    with pytest.raises(ValueError, match="^overlap: "):
+        Protocol("both", keep=0.7, overlap=0.3)

@@ -53,7 +53,7 @@ def make_network(
     vectorized: int = 1,
     cascades: int = 1,
     max_points: int | None = None,
-    initial: Literal["global"] | None = None,
+    initial: Literal["global", "auto"] | None = None,
     seed: int = 0,
 ) -> Solver:
     """A solver that runs a network with these weights.
