@@ -19,6 +19,7 @@ LARGEST_COORDINATE = 1e12
 
 # Normals printed with two digits are off by less than this; colors are off by much more.
 UNIT_TOLERANCE = 0.02
+_ROWS_AT_ONCE = 1 << 16  # so that what is between two steps takes little memory
 
 
 class CloudFileError(Refused):
@@ -103,16 +104,22 @@ def unit_normals(normals: np.ndarray, count: int) -> Float64[np.ndarray, "n 3"]:
     normals = as_float64(normals)
     if normals.shape != (count, 3):
         raise ValueError(f"normals must have the shape ({count}, 3), got {normals.shape}")
-    # The largest component first: the square of 1e200 is not a number we could divide by.
-    largest = np.maximum(normals.max(axis=1), -normals.min(axis=1))[:, None]
-    bad = ~(np.isfinite(largest[:, 0]) & (largest[:, 0] > 0))
-    if bad.any():
-        row = int(np.argmax(bad))
-        x, y, z = normals[row]
-        raise ValueError(f"normal {row} is ({x:g}, {y:g}, {z:g}), wanted a finite direction")
-    normals = normals / largest
-    normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
-    return normals
+    scaled = np.empty_like(normals)
+    for start in range(0, count, _ROWS_AT_ONCE):
+        part = normals[start : start + _ROWS_AT_ONCE]
+        # The largest component first: the square of 1e200 is not a number we could divide by.
+        largest = np.maximum(part.max(axis=1), -part.min(axis=1))[:, None]
+        bad = ~(np.isfinite(largest[:, 0]) & (largest[:, 0] > 0))
+        if bad.any():
+            row = int(np.argmax(bad))
+            x, y, z = part[row]
+            raise ValueError(
+                f"normal {start + row} is ({x:g}, {y:g}, {z:g}), wanted a finite direction"
+            )
+        part = part / largest
+        part /= np.sqrt(np.einsum("ij,ij->i", part, part))[:, None]
+        scaled[start : start + len(part)] = part
+    return scaled
 
 
 def usable_normals(normals: Real[np.ndarray, "n 3"]) -> Real[np.ndarray, "n 3"] | None:

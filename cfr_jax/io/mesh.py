@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float64, Int64, Real
+from jaxtyping import Float64, Int64, Integer, Real
 
 from cfr_jax.io.cloud import PointCloud, checked_points, usable_normals
 
@@ -15,8 +16,8 @@ if TYPE_CHECKING:
 
 DEFAULT_SAMPLES = 10_000
 _AT_ONCE = 1 << 16  # triangles, so that memory stays near what the mesh itself takes
-# All corners one after the other, where each polygon starts among them, and how many it has.
-Polygons = tuple[np.ndarray, np.ndarray, np.ndarray]
+# The corners of all polygons one after the other, or a row for each, and how many each one has.
+Polygons = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,20 +46,18 @@ class Mesh:
     def _sample(self, count: int, seed: int) -> PointCloud:
         """Points uniform over the surface's area, each with its triangle's normal."""
         vertices = checked_points(self.vertices)
-        outside = (self.triangles < 0) | (self.triangles >= len(vertices))
-        if outside.any():
-            triangle, corner = np.argwhere(outside)[0]
-            raise ValueError(
-                f"triangle {triangle} names vertex {self.triangles[triangle, corner]}, "
-                f"wanted 0 to {len(vertices) - 1}"
-            )
+        areas = np.empty(len(self.triangles))
+        for start in range(0, len(areas), _AT_ONCE):
+            named = self.triangles[start : start + _AT_ONCE]
+            outside = (named < 0) | (named >= len(vertices))
+            if outside.any():
+                triangle, corner = np.argwhere(outside)[0]
+                raise ValueError(
+                    f"triangle {start + triangle} names vertex {named[triangle, corner]}, "
+                    f"wanted 0 to {len(vertices) - 1}"
+                )
+            areas[start : start + len(named)] = areas_and_normals(vertices[named])[0]
         generator = np.random.default_rng(seed)
-        areas = np.concatenate(
-            [
-                areas_and_normals(vertices[self.triangles[start : start + _AT_ONCE]])[0]
-                for start in range(0, len(self.triangles), _AT_ONCE)
-            ]
-        )
         chosen = _chosen_by_area(areas, count, generator)
         corners = vertices[self.triangles[chosen]]
         points, normals = _points_within(corners, generator), areas_and_normals(corners)[1]
@@ -80,8 +79,8 @@ def sample_triangles(
 def _chosen_by_area(
     areas: Float64[np.ndarray, " t"], count: int, rng: np.random.Generator
 ) -> Int64[np.ndarray, " n"]:
-    """Triangles drawn as often as their area is large."""
-    cumulative = np.cumsum(areas)
+    """Triangles drawn as often as their area is large; `areas` become their sums."""
+    cumulative = np.cumsum(areas, out=areas)
     if not cumulative[-1] > 0:
         raise ValueError(f"all {len(areas)} triangles have no area, wanted a surface")
     # side="right" never picks a triangle of zero area: its bound equals the one before
@@ -110,30 +109,62 @@ def areas_and_normals(
 
 
 def fan_triangles(
-    values: Real[np.ndarray, " k"], starts: Int64[np.ndarray, " f"], sizes: Int64[np.ndarray, " f"]
+    values: Real[np.ndarray, " k"] | Real[np.ndarray, "f w"],
+    sizes: Integer[np.ndarray, " f"],
+    before: int = 0,
 ) -> Int64[np.ndarray, "t 3"]:
     """Polygons cut into triangles about their first corner.
 
-    Polygon i is `values[starts[i] : starts[i] + sizes[i]]`. Polygons of fewer than three
-    corners enclose nothing and give no triangle.
+    The first `sizes[0]` of the values are the corners of the first polygon, and so on. Polygons of
+    fewer than three corners enclose nothing and give no triangle. Messages count triangles from
+    `before`.
     """
+    total = triangles_within(sizes)
+    flat = values.ndim == 1
+    triangles = np.empty((total, 3), np.int64)
+    done = first = 0
+    for start in range(0, len(sizes), _AT_ONCE):
+        counts = sizes[start : start + _AT_ONCE].astype(np.int64)
+        held = int(counts.sum())
+        part = values[first : first + held] if flat else values[start : start + _AT_ONCE].ravel()
+        first += held
+        for corners in _fans(part, counts):
+            # Text may hold anything; beyond 2^53 a float64 is no index, and NaN compares false.
+            whole = ((np.abs(corners) < 2**53) & (corners % 1 == 0)).all(axis=1)
+            if not whole.all():
+                row = int(np.argmin(whole))
+                raise ValueError(
+                    f"triangle {before + done + row} names vertices {corners[row]}, wanted integers"
+                )
+            triangles[done : done + len(corners)] = corners
+            done += len(corners)
+    return triangles
+
+
+def triangles_within(sizes: Integer[np.ndarray, " f"]) -> int:
+    """How many triangles polygons of so many corners give."""
+    starts = range(0, len(sizes), _AT_ONCE)
+    return sum(
+        int(np.maximum(sizes[start : start + _AT_ONCE].astype(np.int64) - 2, 0).sum())
+        for start in starts
+    )
+
+
+def _fans(
+    values: Real[np.ndarray, " k"], sizes: Int64[np.ndarray, " f"]
+) -> Iterator[Real[np.ndarray, "t 3"]]:
+    """The corners of the triangles of a block of polygons, a block of triangles at a time."""
+    if (sizes == 3).all():
+        yield values.reshape(-1, 3)
+        return
+    starts = np.cumsum(sizes) - sizes
     counts = np.maximum(sizes - 2, 0)
     ends = np.cumsum(counts)
     total = int(ends[-1]) if len(ends) else 0
-    triangles = np.empty((total, 3), np.int64)
     for start in range(0, total, _AT_ONCE):
         rows = np.arange(start, min(start + _AT_ONCE, total))
         polygon = np.searchsorted(ends, rows, side="right")
         # The running number of a triangle within its polygon.
         within = rows - (ends[polygon] - counts[polygon])
         firsts = starts[polygon][:, None]
-        corners = values[firsts + np.stack([0 * within, within + 1, within + 2], axis=1)]
-        # Text may hold anything; beyond 2^53 a float64 is no index, and NaN compares false.
-        whole = ((np.abs(corners) < 2**53) & (corners % 1 == 0)).all(axis=1)
-        if not whole.all():
-            row = int(np.argmin(whole))
-            raise ValueError(
-                f"triangle {start + row} names vertices {corners[row]}, wanted integers"
-            )
-        triangles[start : start + len(rows)] = corners
-    return triangles
+        yield values[firsts + np.stack([0 * within, within + 1, within + 2], axis=1)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Real
 
 from cfr_jax.io.cloud import PointCloud, as_float64, usable_normals
 from cfr_jax.io.mesh import Mesh, Polygons, fan_triangles
@@ -16,6 +16,7 @@ from cfr_jax.io.unnamed import roles_of_unnamed
 
 # Of the cloud's extent; no scanner is as precise.
 _LARGEST_ROUNDING = 1e-5
+_ROWS_AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,8 +140,8 @@ def table_of_mesh(mesh: Mesh) -> Table:
     vertices = np.asarray(mesh.vertices)
     names, values, roles = ("x", "y", "z"), tuple(vertices.T), Roles((0, 1, 2))
     count = len(mesh.triangles)
-    sizes = np.full(count, 3, np.int64)
-    polygons = np.asarray(mesh.triangles).reshape(-1), 3 * np.arange(count), sizes
+    sizes = np.broadcast_to(np.uint8(3), count)
+    polygons = np.asarray(mesh.triangles), sizes
     return Table(names, values, roles, True, polygons if count else None)
 
 
@@ -156,16 +157,38 @@ def cloud_of_filled(
     Rows with NaN or infinity in x, y or z are cells without a point: they are left out, and counted
     in `left_out`. Raises ValueError where no row is left.
     """
-    filled = np.isfinite(points).all(axis=1) if len(points) else np.ones(0, bool)
+    filled = finite_rows(points)
     left_out = len(points) - int(np.count_nonzero(filled))
     if left_out and left_out == len(points):
         raise ValueError(
             f"all {left_out} points are NaN or infinite, wanted at least one that is not"
         )
     if left_out:
-        points, normals = points[filled], None if normals is None else normals[filled]
+        own = table is None  # its columns may be views of the points
+        points = _kept(points, filled, own)
+        normals = None if normals is None else _kept(normals, filled, own)
     usable = None if normals is None or not len(points) else usable_normals(normals)
     return PointCloud(points, usable, name, left_out, notes, table)
+
+
+def finite_rows(points: Real[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Which rows hold numbers in all of their columns."""
+    filled = np.isfinite(points[:, 0])
+    for column in points.T[1:]:
+        filled &= np.isfinite(column)
+    return filled
+
+
+def _kept(rows: np.ndarray, chosen: Bool[np.ndarray, " n"], own: bool) -> np.ndarray:
+    """The chosen rows: moved together within their own memory where that is free to use."""
+    if not own or not rows.flags.writeable:
+        return rows[chosen]
+    done = 0
+    for start in range(0, len(rows), _ROWS_AT_ONCE):
+        part = rows[start : start + _ROWS_AT_ONCE][chosen[start : start + _ROWS_AT_ONCE]]
+        rows[done : done + len(part)] = part
+        done += len(part)
+    return rows[:done]
 
 
 def rounding(points: Float64[np.ndarray, "n 3"], kind: np.dtype) -> float:
@@ -199,7 +222,7 @@ def without_faces(cloud: PointCloud, form: str) -> tuple[Table, list[str]]:
     table = cloud.table
     if table is None:
         return plain_table(cloud), []
-    if table.polygons is not None and len(table.polygons[2]):
+    if table.polygons is not None and len(table.polygons[1]):
         note = f"{form} holds no faces: wrote {len(cloud)} points drawn from them; .ply holds both"
         return plain_table(cloud), [note]
     return table, []

@@ -1,106 +1,152 @@
-"""Files whose rows are short grow in memory: they stay within the budget, or are refused."""
+"""Files that grow when they are read stay within the budget, or are refused: 64 MB and four times
+the file, and a second of one core for 10 MB.
+
+Each file is read in a process of its own, forked from one that has loaded everything before, so
+that no memory is left over from another file. What that process allocated at its peak is the cost.
+"""
 
 from __future__ import annotations
 
 import json
 import os
-import struct
+import random
+import resource
 import subprocess
 import sys
 import tempfile
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-from kind_samples import npy
-from test_io_mutations import BYTES, BYTES_PER_BYTE, SECONDS, _memory, _reset_peak
+import pytest
+from amplifiers import makers
 
-SIZE = 20_000_000  # bytes: where four times the file weigh more than what is always allowed
-
-
-def dense_files(size: int) -> dict[str, bytes]:
-    """Files of about that many bytes with as little as possible to each point or face."""
-    third, triangle = size // 3, struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
-    floats = "property float x\nproperty float y\nproperty float z\n"
-    faces = f"vertex 3\n{floats}element face {size // 9 * 2}\n"
-    faces += "property list uchar uchar vertex_indices\n"
-    pcd = f"FIELDS x y z\nSIZE 1 1 1\nTYPE U U U\nPOINTS {third}\nDATA binary\n"
-    lists = struct.pack("<3fB", 1, 2, 3, 0) + struct.pack("<3fBH", 1, 2, 4, 1, 5)
-    count = size // len(lists)
-    names = f"vertex {2 * count}\n{floats}property list uchar ushort seen\n"
-    pose = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
-    facet = b"facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
-    facet += b"endloop\nendfacet\n"
-
-    def ply(element: str, body: bytes) -> bytes:
-        head = f"ply\nformat binary_little_endian 1.0\nelement {element}end_header\n"
-        return head.encode() + body
-
-    return {
-        "digits.xyz": b"1 2 3\n" * (size // 6),
-        "newlines.txt": b"1 2 3\n" + b"\n" * size,
-        "comments.txt": b"1 2 3\n" + b"#\n" * (size // 8),
-        "one line.asc": b"1 " * (size // 2),
-        "one cell.xyz": b"1 2 3\n4 5 " + b"1" * size,
-        "words.csv": b"x,y,z,w\n" + b"1,2,3,a\n" * (size // 8),
-        "points.pts": b"1 2 3\n" * (size // 6),
-        "grid.ptx": f"{size // 8}\n1\n{pose}".encode() + b"1 2 3 4\n" * (size // 8),
-        "wide.csv": ("x,y,z\n" + "1,2,3\n" * (size // 12)).encode("utf-16"),
-        "bytes.ply": ply(f"vertex {third}\n{floats.replace('float', 'uchar')}", b"\1\2\3" * third),
-        "faces.ply": ply(faces, triangle + b"\3\0\1\2\4\0\1\2\0" * (size // 9)),
-        "polygon.ply": ply(
-            faces.replace(f"face {size // 9 * 2}", "face 1").replace("list uchar", "list uint"),
-            triangle + struct.pack("<I", size) + b"\0\1\2\0" * (size // 4),
-        ),
-        "lists.ply": ply(names, lists * count),
-        "bytes.pcd": pcd.encode() + b"\1\2\3" * third,
-        "bytes.npy": npy(np.ones((third, 3), "i1")),
-        "solids.stl": (b"solid a\n" + facet + b"endsolid a\n") * (size // 160),
-    }
+SECONDS, BYTES, BYTES_PER_BYTE = 1.0, 64 << 20, 4
+_ADDRESS_SPACE, _LONGEST = 12 << 30, 60  # end what runs away before it takes the machine
 
 
-def run_cases() -> list[str]:
-    """What was wrong about reading each of them, bare and with all properties."""
+def in_a_fork(call: Callable[..., dict], *given: object) -> dict:
+    """What `call` returns in a fork of this process, whose memory then goes with it."""
+    told, tell = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(told)
+        with os.fdopen(tell, "w") as stream:
+            json.dump(call(*given), stream)
+            stream.flush()
+            os._exit(0)
+    os.close(tell)
+    with os.fdopen(told) as stream:
+        text = stream.read()
+    _, status = os.waitpid(child, 0)
+    return json.loads(text) if text else {"died": status}
+
+
+def _make(path: Path, name: str, size: int, seed: str) -> dict:
+    path.write_bytes(makers()[name](size, random.Random(seed)))
+    return {"size": path.stat().st_size}
+
+
+def _read(path: Path, whole: bool) -> dict:
     from cfr_jax.io import CloudFileError, read
 
+    resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_SPACE, _ADDRESS_SPACE))
+    resource.setrlimit(resource.RLIMIT_CPU, (_LONGEST, _LONGEST))
+    Path("/proc/self/clear_refs").write_text("5")  # forgets the largest memory so far
+    before, start = _memory("VmRSS"), time.process_time()
+    error = ""
+    try:
+        read(path, properties=whole)
+    except CloudFileError as refusal:
+        error = str(refusal)
+    except BaseException as other:
+        return {"raised": f"{type(other).__name__}: {other}"}
+    seconds = time.process_time() - start
+    return {"seconds": seconds, "bytes": _memory("VmHWM") - before, "error": error}
+
+
+def _memory(key: str) -> int:
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.split(f"{key}:")[1].split()[0])
+
+
+def run_cases(size: int, seeds: int, names: list[str]) -> dict[str, dict]:
+    """The cost of each kind of file with each seed, bare and with all properties."""
     warnings.simplefilter("ignore")
-    failures = []
+    costs = {}
     with tempfile.TemporaryDirectory() as folder:
-        small = dense_files(2_000)
-        for name, data in dense_files(SIZE).items():
-            path, warm = Path(folder) / name, Path(folder) / f"small {name}"
-            path.write_bytes(data)
-            warm.write_bytes(small[name])
-            size = len(data)
-            del data
-            for whole in (False, True):
-                before = 0
-                for each in (warm, path):  # what is loaded only once is no cost of a case
-                    before, start = _reset_peak(), time.process_time()
-                    try:
-                        read(each, properties=whole)
-                    except CloudFileError:
-                        pass
-                seconds, grown = time.process_time() - start, _memory("VmHWM") - before
-                if grown > BYTES + BYTES_PER_BYTE * size:
-                    failures.append(f"{name}, whole={whole}: {grown >> 20} MiB for {size >> 20}")
-                if seconds > SECONDS * size / 1e7:
-                    failures.append(f"{name}, whole={whole}: {seconds:.1f} s for {size >> 20} MiB")
-            path.unlink()
-    return failures
+        for name in names or makers():
+            warm = Path(folder) / f"small {name}"
+            in_a_fork(_make, warm, name, 3_000, name)
+            for whole in (False, True):  # what is loaded only once is no cost of a file
+                _read_quietly(warm, whole)
+            for seed in range(seeds):
+                path = Path(folder) / name
+                made = in_a_fork(_make, path, name, size, f"{name} {seed}")
+                for whole in (False, True):
+                    costs[f"{name}, {seed}, {whole}"] = made | in_a_fork(_read, path, whole)
+                path.unlink()
+    return costs
 
 
-def test_dense_files_stay_within_four_times_their_size_and_a_second_for_ten_megabytes():
+def _read_quietly(path: Path, whole: bool) -> None:
+    from cfr_jax.io import CloudFileError, read
+
+    if path.stat().st_size > 100_000:
+        return
+    try:
+        read(path, properties=whole)
+    except CloudFileError:
+        pass
+
+
+def excesses(costs: dict[str, dict]) -> list[str]:
+    """In words, what took more than it may."""
+    found = []
+    for case, cost in costs.items():
+        if "bytes" not in cost:
+            found.append(f"{case}: {cost}")
+        elif cost["bytes"] > BYTES + BYTES_PER_BYTE * cost["size"]:
+            found.append(f"{case}: {cost['bytes'] >> 20} MiB for {cost['size'] / 1e6:.2f} MB")
+        elif cost["seconds"] > SECONDS * max(cost["size"] / 1e7, 1):
+            found.append(f"{case}: {cost['seconds']:.2f} s for {cost['size'] / 1e6:.2f} MB")
+    return found
+
+
+def measured(size: int, seeds: int, names: tuple[str, ...] = (), seconds: int = 500) -> dict:
+    """`run_cases` in a fresh interpreter."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-
     child = subprocess.run(
-        [sys.executable, __file__], capture_output=True, text=True, timeout=300, env=environment
-    )
-
+        [sys.executable, __file__, str(size), str(seeds), *names],
+        capture_output=True, text=True, timeout=seconds, env=environment,
+    )  # fmt: skip
     assert child.returncode == 0, child.stderr[-2000:]
-    assert json.loads(child.stdout) == []
+    return json.loads(child.stdout)
+
+
+def test_files_that_grow_stay_within_four_times_their_size_and_a_second_for_ten_megabytes():
+    costs = measured(2_000_000, 1)
+    assert len(costs) == 2 * len(makers())
+    assert excesses(costs) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [300_000, 12_000_000, 50_000_000])
+@pytest.mark.parametrize("name", makers())
+def test_files_that_grow_stay_within_their_budget_at_every_size(name, size):
+    costs = measured(size, 3 if size < 50_000_000 else 2, (name,))
+    assert len(costs) > 0
+    assert excesses(costs) == []
+
+
+def test_the_meter_sees_memory_and_time(tmp_path):
+    """Of a file of 24 MB, 24 MB are read and as many are made of them."""
+    costs = measured(24_000_000, 1, ("scan.bin",))
+    for cost in costs.values():
+        assert cost["error"] == "" and 24e6 + 36e6 < cost["bytes"] < 4 * 24e6 + BYTES
+        assert 0.005 < cost["seconds"]
 
 
 if __name__ == "__main__":
-    print(json.dumps(run_cases()))
+    print(json.dumps(run_cases(int(sys.argv[1]), int(sys.argv[2]), sys.argv[3:])))

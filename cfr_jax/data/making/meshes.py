@@ -75,7 +75,7 @@ def parse_ac3d(data: bytes, name: str) -> Mesh:
     vertices = np.concatenate(reader.vertices) if reader.vertices else np.zeros((0, 3))
     sizes = np.array([len(polygon) for polygon in reader.polygons], np.int64)
     corners = np.array([corner for polygon in reader.polygons for corner in polygon], np.int64)
-    return Mesh(vertices, fan_triangles(corners, np.cumsum(sizes) - sizes, sizes), name)
+    return Mesh(vertices, fan_triangles(corners, sizes), name)
 
 
 class _Ac3d:

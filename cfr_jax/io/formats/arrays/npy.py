@@ -8,7 +8,7 @@ import re
 
 import numpy as np
 
-from cfr_jax.io.budget import check_room
+from cfr_jax.io.budget import POINT, check_room
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.mesh import Mesh
 from cfr_jax.io.naming import HOW_TO_SAY
@@ -34,9 +34,12 @@ def parse(
 
 
 def table_of_array(
-    array: np.ndarray, columns: tuple[str, ...] | None, size: int
+    array: np.ndarray, columns: tuple[str, ...] | None, size: int, taken: int = 0
 ) -> tuple[Table, tuple[str, ...]]:
-    """The columns of an array that a file of `size` bytes holds, and notes on their meaning."""
+    """The columns of an array that a file of `size` bytes holds, and notes on their meaning.
+
+    The array itself has `taken` bytes of memory beside the file.
+    """
     if not array.dtype.names and array.dtype.kind not in "fiu":
         raise CloudFileError(f"holds {array.dtype}, wanted floats or integers")
     if not array.dtype.names and array.ndim not in (2, 3):
@@ -44,7 +47,8 @@ def table_of_array(
     if array.ndim == 3 and array.dtype == np.uint8 and columns is None:
         raise CloudFileError(f"is {array.shape} of bytes, an image? {HOW_TO_SAY}")
     rows = array.size if array.dtype.names else array.size // max(array.shape[-1], 1)
-    check_room(rows, 24, size, f"points of {array.dtype}")
+    each = POINT if array.dtype.names or array.shape[-1] != 6 else 3 * POINT  # normals and units
+    check_room(rows, each, size, f"points of {array.dtype!s:.60}", taken)
     if array.dtype.names:
         rows_of_all = array.reshape(-1)
         names = list(array.dtype.names)

@@ -9,16 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from cfr_jax.io.budget import POINT, check_room
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.formats.arrays.npy import read_array, table_of_array
 from cfr_jax.io.mesh import Mesh
 from cfr_jax.io.naming import Roles, are_names, roles_of
 from cfr_jax.io.table import Table
-
-# What a small archive may unfold to, so that a few kilobytes cannot fill the memory. Coordinates
-# do not compress a hundredfold.
-_ALWAYS_ALLOWED = 32 << 20
-_LARGEST_RATIO = 100
 
 _POINTS = (
     "points",
@@ -72,16 +68,12 @@ class _Arrays:
         self, archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], size: int
     ) -> None:
         self._archive, self.members, self.size = archive, members, size
-        self._room = _ALWAYS_ALLOWED + _LARGEST_RATIO * size
+        self.taken = 0
 
     def __getitem__(self, key: str) -> np.ndarray:
         info = self.members[key]
-        self._room -= info.file_size
-        if self._room < 0:
-            raise CloudFileError(
-                f"{info.filename!r} unfolds to {info.file_size} bytes, "
-                f"more than {_LARGEST_RATIO} times the file"
-            )
+        self.taken += info.file_size
+        check_room(self.taken, 1, self.size, f"bytes with {info.filename!r:.60} unfolded")
         with self._archive.open(info) as stream:
             data = stream.read(info.file_size)
         try:
@@ -101,6 +93,7 @@ def _table(arrays: _Arrays, columns: tuple[str, ...] | None) -> tuple[Table, tup
         roles = roles_of(names)
         chosen = [names[k] for k in (*roles.points, *roles.normals)]
         values = [arrays[key] for key in chosen]
+        check_room(len(values[0]), 3 * POINT, arrays.size, "points", arrays.taken)
         if any(v.ndim != 1 or v.shape != values[0].shape for v in values):
             raise CloudFileError(f"arrays {', '.join(chosen)}: wanted one axis of equal length")
         inner = Roles((0, 1, 2), (3, 4, 5) if roles.normals else ())
@@ -115,6 +108,7 @@ def _table(arrays: _Arrays, columns: tuple[str, ...] | None) -> tuple[Table, tup
     beside = arrays.called(_NORMALS)
     if len(beside) == 1 and not array.dtype.names and columns is None:
         flat = array.reshape(-1, array.shape[-1])
+        check_room(len(flat), 3 * POINT, arrays.size, "points with normals", arrays.taken)
         normals = arrays[beside[0]]
         normals = normals.reshape(-1, normals.shape[-1])
         if flat.shape[1] == 3 and normals.shape == flat.shape:
@@ -123,7 +117,7 @@ def _table(arrays: _Arrays, columns: tuple[str, ...] | None) -> tuple[Table, tup
         raise CloudFileError(
             f"{key!r} is {array.shape} and {beside[0]!r} {normals.shape}, wanted (n, 3) of both"
         )
-    table, notes = table_of_array(array, columns, arrays.size)
+    table, notes = table_of_array(array, columns, arrays.size, arrays.taken)
     if not array.dtype.names and array.shape[-1] == 3:
         flat = array.reshape(-1, 3)
         return Table((key,), (flat,), Roles((0,)), source="NPZ"), notes

@@ -14,6 +14,7 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float64, Int32, UInt8
 
+from cfr_jax.io.budget import POINT, room
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.formats.las.chunks import check_chunks
 from cfr_jax.io.formats.las.fields import properties
@@ -24,7 +25,7 @@ _ROW_SIZES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
 _RECORD_HEADER = 54
 _LASZIP = (b"laszip encoded", 22204)
 _EXTRA_BYTES = (b"LASF_Spec", 4)
-_ROWS_AT_ONCE = 1 << 16
+_ROWS_AT_ONCE, _BYTES_AT_ONCE = 1 << 16, 1 << 22
 
 
 def parse(
@@ -64,7 +65,7 @@ def parse(
         record = _record(data, header_size, start, records, _LASZIP)
         if record is None:
             raise CloudFileError("wanted a 'laszip encoded' record, found none")
-        integers, rows = _unpack(data, start, count, row_size, record, whole)
+        points, rows = _unpack(data, start, count, row_size, record, whole, scale, offset)
     else:
         if start + count * row_size > len(data):
             raise CloudFileError(
@@ -73,7 +74,7 @@ def parse(
             )
         integers = np.ndarray((count, 3), "<i4", data, start, (row_size, 4))
         rows = np.ndarray((count, row_size), np.uint8, data, start)
-    points = _scaled(integers, scale, offset)
+        points = _scaled(integers, scale, offset)
     if not whole or rows is None:
         return cloud_of_filled(points, None, name)
     described = _record(data, header_size, start, records, _EXTRA_BYTES) or b""
@@ -109,14 +110,23 @@ def _record(
 
 
 def _unpack(
-    data: bytes, start: int, count: int, row_size: int, record: bytes, whole: bool
-) -> tuple[Int32[np.ndarray, "n 3"], UInt8[np.ndarray, "n size"] | None]:
+    data: bytes,
+    start: int,
+    count: int,
+    row_size: int,
+    record: bytes,
+    whole: bool,
+    scale: Float64[np.ndarray, " 3"],
+    offset: Float64[np.ndarray, " 3"],
+) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n size"] | None]:
     """The coordinates, and all bytes of the points if they are wanted as a whole."""
     lazrs = _import_lazrs()
     check_chunks(data, start, count, row_size, record)
-    integers = np.empty((count, 3), np.int32)
+    _check_count(count, row_size, len(data), whole)
+    points = np.empty((count, 3))
     held = np.empty((count, row_size), np.uint8) if whole else None
-    rows = np.empty((min(count, _ROWS_AT_ONCE), row_size), np.uint8)
+    at_once = max(1, min(count, _ROWS_AT_ONCE, _BYTES_AT_ONCE // row_size))
+    rows = np.empty((at_once, row_size), np.uint8)
     done = 0
     try:
         stream = io.BytesIO(data)
@@ -125,7 +135,8 @@ def _unpack(
         while done < count:
             part = rows[: count - done]
             unpacker.decompress_many(part.reshape(-1))
-            integers[done : done + len(part)] = part[:, :12].copy().view("<i4")
+            integers = part[:, :12].copy().view("<i4")
+            points[done : done + len(part)] = _scaled(integers, scale, offset)
             if held is not None:
                 held[done : done + len(part)] = part
             done += len(part)
@@ -135,7 +146,22 @@ def _unpack(
         raise CloudFileError(
             f"byte {start}: cannot unpack points {done} and following of {count}: {error}"
         ) from None
-    return integers, held
+    return points, held
+
+
+def _check_count(count: int, row_size: int, size: int, whole: bool) -> None:
+    """Refuses more points than the budget allows: those along a line take no bytes at all.
+
+    Decoding takes time by the byte, also of what is not kept.
+    """
+    # Beside its bytes, a row has a dozen values of a byte that were bits, and perhaps a copy of
+    # what is behind its known fields.
+    each = POINT + 2 * row_size if whole else POINT
+    if max(count * each, count * row_size / 2) > room(size):
+        raise CloudFileError(
+            f"{count} points in {size} bytes are more than we read, wanted a smaller file, or the "
+            "same points as .las"
+        )
 
 
 def _import_lazrs() -> ModuleType:

@@ -10,23 +10,21 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
-from cfr_jax.io.cloud import CloudFileError, PointCloud, as_float64
+from cfr_jax.io.budget import check_json, check_surface
+from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.files import contents
-from cfr_jax.io.formats.meshes.nodes import get, placement
+from cfr_jax.io.formats.meshes.nodes import get, is_moved, placement
+from cfr_jax.io.formats.meshes.primitives import POINTS, SURFACES, TRIANGLES, Primitive
 from cfr_jax.io.mesh import Mesh
 from cfr_jax.io.table import cloud_of_filled
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}
-_POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
-_SURFACES = (_TRIANGLES, _STRIP, _FAN)
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
-# A mesh may be placed many times; this bounds the rows that a small file can unfold to.
-_ALWAYS_ALLOWED_ROWS = 1 << 19
-_MOST_ROWS_PER_BYTE = 1
-_ROWS_PER_PRIMITIVE = 64  # what even an empty one takes, in time
+# What takes time however little it holds: nodes, and primitives, which take several times that.
+_STEPS, _BYTES_OF_A_STEP, _STEPS_OF_A_PRIMITIVE = 20_000, 300, 5
 
 
 def parse_glb(data: bytes, name: str, folder: Path) -> Mesh | PointCloud:
@@ -41,7 +39,8 @@ def parse_glb(data: bytes, name: str, folder: Path) -> Mesh | PointCloud:
         raise CloudFileError(
             f"byte 4: version {version}, {length} bytes; wanted version 2 and at most {len(data)}"
         )
-    chunks: dict[int, bytes] = {}
+    chunks: dict[int, memoryview] = {}
+    whole = memoryview(data)
     position = 12
     while position + 8 <= length:
         size, kind = struct.unpack_from("<II", data, position)
@@ -50,11 +49,12 @@ def parse_glb(data: bytes, name: str, folder: Path) -> Mesh | PointCloud:
             raise CloudFileError(
                 f"byte {position - 8}: a chunk of {size} bytes ends behind the file"
             )
-        chunks.setdefault(kind, data[position : position + size])
+        if kind in (_JSON_CHUNK, _BINARY_CHUNK):
+            chunks.setdefault(kind, whole[position : position + size])
         position += size
     if _JSON_CHUNK not in chunks:
         raise CloudFileError("byte 12: wanted a chunk of JSON, found none")
-    return _Scene(chunks[_JSON_CHUNK], chunks.get(_BINARY_CHUNK), folder).shape(name)
+    return _Scene(bytes(chunks[_JSON_CHUNK]), chunks.get(_BINARY_CHUNK), folder).shape(name)
 
 
 def parse_gltf(data: bytes, name: str, folder: Path) -> Mesh | PointCloud:
@@ -65,7 +65,9 @@ def parse_gltf(data: bytes, name: str, folder: Path) -> Mesh | PointCloud:
 class _Scene:
     """The parts of a glTF document that say where triangles are."""
 
-    def __init__(self, text: bytes, binary: bytes | None, folder: Path) -> None:
+    def __init__(self, text: bytes, binary: memoryview | None, folder: Path) -> None:
+        self.size = len(text) + len(binary or b"")
+        check_json(text, self.size)
         try:
             self.document = json.loads(text)
         except (ValueError, RecursionError) as error:
@@ -73,8 +75,8 @@ class _Scene:
         if not isinstance(self.document, dict):
             raise CloudFileError("wanted a JSON object")
         self.folder = folder
-        self.buffers: dict[int, bytes] = {} if binary is None else {0: binary}
-        self.room = _ALWAYS_ALLOWED_ROWS + _MOST_ROWS_PER_BYTE * (len(text) + len(binary or b""))
+        self.buffers: dict[int, bytes | memoryview] = {} if binary is None else {0: binary}
+        self.steps = 0
         needed = get(self.document, "extensionsRequired", list, [])
         packed = [name for name in needed if "compression" in str(name)]
         if packed:
@@ -82,28 +84,47 @@ class _Scene:
 
     def shape(self, name: str) -> Mesh | PointCloud:
         """All triangles, or the points of a scene without any, in the frame of the scene."""
-        mesh = self._gathered(name, _SURFACES)
+        mesh = self._gathered(name, SURFACES)
         if len(mesh.triangles) == 0:
-            points = self._gathered(name, (_POINTS,)).vertices
+            points = self._gathered(name, (POINTS,)).vertices
             if len(points):
                 return cloud_of_filled(np.asarray(points), None, name)
         return mesh
 
     def _gathered(self, name: str, modes: tuple[int, ...]) -> Mesh:
-        vertices: list[np.ndarray] = [np.empty((0, 3))]
-        triangles: list[np.ndarray] = [np.empty((0, 3), np.int64)]
-        count = 0
-        for index, placed in self._placed_meshes():
-            for primitive in get(self._item("meshes", index), "primitives", list):
-                points, faces = self._primitive(primitive, modes)
-                self.room -= len(points) + len(faces) + _ROWS_PER_PRIMITIVE
-                if self.room < 0:
-                    raise CloudFileError("unfolds, by meshes placed again, to more than we read")
+        placed: list[tuple[Primitive, Float64[np.ndarray, "4 4"]]] = []
+        count = faces = 0
+        for index, at in self._placed_meshes():
+            for described in get(self._item("meshes", index), "primitives", list):
+                self._take(_STEPS_OF_A_PRIMITIVE)
+                primitive = self._primitive(described, modes)
+                if primitive is not None:
+                    placed.append((primitive, at))
+                    count += primitive.points
+                    faces += primitive.triangles
+                    check_surface(count, faces, self.size)
+        vertices, triangles = np.empty((count, 3)), np.empty((faces, 3), np.int64)
+        done = filled = 0
+        for primitive, at in placed:
+            first = done
+            for points in primitive.blocks_of_points():
                 with np.errstate(all="ignore"):  # what is not finite is refused later on
-                    vertices.append(points @ placed[:3, :3].T + placed[:3, 3])
-                triangles.append(faces + count)
-                count += len(points)
-        return Mesh(np.concatenate(vertices), np.concatenate(triangles), name)
+                    points = points @ at[:3, :3].T + at[:3, 3]
+                vertices[done : done + len(points)] = points
+                done += len(points)
+            for corners in primitive.blocks_of_triangles():
+                triangles[filled : filled + len(corners)] = corners + first
+                filled += len(corners)
+        return Mesh(vertices, triangles, name)
+
+    def _take(self, steps: int) -> None:
+        """Counts what takes time; raises CloudFileError where that is too much for the file."""
+        self.steps += steps
+        if self.steps > _STEPS + self.size / _BYTES_OF_A_STEP:
+            raise CloudFileError(
+                f"{self.size} bytes hold too many nodes, or place too many meshes again, wanted "
+                "larger meshes or fewer of them"
+            )
 
     def _placed_meshes(self) -> list[tuple[int, Float64[np.ndarray, "4 4"]]]:
         """Each mesh of the scene with the transform of its frame into the scene's."""
@@ -122,46 +143,35 @@ class _Scene:
         while todo:
             index, above = todo.pop()
             node = self._item("nodes", index)
+            self._take(1)
             if index in visited:  # nodes are trees: without this a cycle would not end
                 raise CloudFileError(f"node {index} hangs below two nodes, wanted a tree")
             visited.add(index)
-            with np.errstate(all="ignore"):
-                placed_at = above @ placement(node)
+            placed_at = above
+            if is_moved(node):
+                with np.errstate(all="ignore"):
+                    placed_at = above @ placement(node)
             if "mesh" in node:
                 placed.append((get(node, "mesh", int), placed_at))
             todo += [(child, placed_at) for child in reversed(get(node, "children", list, []))]
         return placed
 
-    def _primitive(
-        self, primitive: Any, modes: tuple[int, ...]
-    ) -> tuple[np.ndarray, Int64[np.ndarray, "t 3"]]:
-        mode = get(primitive, "mode", int, _TRIANGLES)
+    def _primitive(self, described: Any, modes: tuple[int, ...]) -> Primitive | None:
+        mode = get(described, "mode", int, TRIANGLES)
         if mode not in modes:
-            return np.empty((0, 3)), np.empty((0, 3), np.int64)
-        attributes = get(primitive, "attributes", dict)
-        points = as_float64(self._accessor(get(attributes, "POSITION", int), "VEC3"))
-        corners = np.arange(len(points))
-        if "indices" in primitive:
-            corners = self._accessor(get(primitive, "indices", int), "SCALAR")[:, 0]
+            return None
+        attributes = get(described, "attributes", dict)
+        positions, scale = self._accessor(get(attributes, "POSITION", int), "VEC3")
+        corners = None
+        if "indices" in described:
+            corners = self._accessor(get(described, "indices", int), "SCALAR")[0][:, 0]
             if corners.dtype.kind == "f":
                 raise CloudFileError("the indices of a primitive are floats, wanted integers")
-            corners = corners.astype(np.int64)
-            if len(corners) and corners.max() >= len(points):
-                raise CloudFileError(
-                    f"a primitive names vertex {corners.max()}, wanted 0 to {len(points) - 1}"
-                )
-        if mode == _POINTS:
-            return points[corners], np.empty((0, 3), np.int64)
-        if mode == _TRIANGLES:
-            return points, corners[: len(corners) // 3 * 3].reshape(-1, 3)
-        ends = np.arange(2, max(len(corners), 2))
-        if mode == _FAN:
-            return points, corners[np.stack([0 * ends, ends - 1, ends], axis=1)]
-        odd = ends % 2  # every other triangle of a strip runs the other way around
-        return points, corners[np.stack([ends - 2 + odd, ends - 1 - odd, ends], axis=1)]
+        return Primitive(positions, scale, corners, mode)
 
-    def _accessor(self, index: int, kind: str) -> np.ndarray:
-        """The rows an accessor stands for, (n, 1) or (n, 3), in floats or integers."""
+    def _accessor(self, index: int, kind: str) -> tuple[np.ndarray, float | None]:
+        """The rows an accessor stands for, (n, 1) or (n, 3), in floats or integers, and what
+        normalized integers are divided by."""
         accessor = self._item("accessors", index)
         code = get(accessor, "componentType", int)
         if get(accessor, "type", str) != kind or code not in _COMPONENTS or "sparse" in accessor:
@@ -187,21 +197,23 @@ class _Scene:
         strides = (stride, dtype.itemsize)
         rows = np.ndarray((count, width), dtype, data, begin + skipped, strides)
         if kind == "VEC3" and get(accessor, "normalized", bool, False) and dtype.kind != "f":
-            rows = np.maximum(rows / np.iinfo(dtype).max, -1.0)
-        return rows
+            return rows, float(np.iinfo(dtype).max)
+        return rows, None
 
-    def _buffer(self, index: int) -> bytes:
+    def _buffer(self, index: int) -> bytes | memoryview:
         if index not in self.buffers:
             uri = get(self._item("buffers", index), "uri", str)
             if uri.startswith("data:"):
-                head, _, text = uri.partition(",")
+                comma = uri.find(",") + 1
                 try:
-                    self.buffers[index] = base64.b64decode(text, validate=True)
+                    # whatever is no letter of base64, as all of a text without a comma, is refused
+                    self.buffers[index] = base64.b64decode(uri[comma:], validate=True)
                 except ValueError as error:
-                    raise CloudFileError(f"buffer {index}: {head[:60]}: {error}") from None
+                    raise CloudFileError(f"buffer {index}: {uri[:60]}: {error}") from None
+                del self.document["buffers"][index]["uri"]  # it is long, and not needed again
             else:
                 self.buffers[index] = self._beside(index, unquote(uri))
-            self.room += _MOST_ROWS_PER_BYTE * len(self.buffers[index])
+                self.size += len(self.buffers[index])
         return self.buffers[index]
 
     def _beside(self, index: int, uri: str) -> bytes:

@@ -12,6 +12,11 @@ from cfr_jax.io.cloud import CloudFileError
 T = TypeVar("T")
 
 
+def is_moved(node: dict[str, Any]) -> bool:
+    """Whether a node says where it is."""
+    return not node.keys().isdisjoint(("matrix", "rotation", "scale", "translation"))
+
+
 def placement(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
     """A node's transform, of its own frame into the one above."""
     if "matrix" in node:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cfr_jax.io.cloud import CloudFileError
-from cfr_jax.io.formats.text.lines import Lines, clean_text
+from cfr_jax.io.formats.text.lines import Text, clean_text
 
 _KINDS = {
     ("F", 4): "<f4", ("F", 8): "<f8",
@@ -108,7 +108,7 @@ def _points_that_fit(
     """Of the two numbers of points in a header, the one that the body has."""
     storage = entries["DATA"][0].lower()
     if storage == "ascii":
-        rows = len(Lines(clean_text(data[body:])))
+        rows = Text(clean_text(data), body).left()
     else:
         size = row_size(kinds, repeats)
         held = len(data) - body

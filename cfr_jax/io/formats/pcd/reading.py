@@ -1,7 +1,7 @@
 """PCD: text, binary, and compressed binary.
 
 Read here because pypcd4, the one library that is kept up, trusts the counts of the header, and
-needs pydantic and a compiled LZF for what is a page of numpy.
+needs pydantic for what is a page of numpy.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ import struct
 
 import numpy as np
 
-from cfr_jax.io.budget import check_room
+from cfr_jax.io.budget import POINT, check_room
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.formats.pcd.header import Header, parse_header
-from cfr_jax.io.formats.pcd.lzf import LARGEST_RATIO, decompress
-from cfr_jax.io.formats.text.lines import Lines, clean_text
+from cfr_jax.io.formats.text.lines import Text, clean_text
 from cfr_jax.io.mesh import Mesh
 from cfr_jax.io.table import Table, table_of
 
 SOURCE = "PCD"
 PADDING = "_"
+_LARGEST_RATIO = 88  # of LZF: three bytes repeat at most 264
 
 
 def parse(
@@ -37,7 +37,7 @@ def parse(
         values = _read_rows(data, header)
     else:
         values = _read_compressed(data, header)
-    check_room(header.points, 24, len(data), "points")
+    check_room(header.points, POINT, len(data), "points")
     return _table(header, values, columns, whole).shape(name, (), whole)
 
 
@@ -63,8 +63,8 @@ def _table(
 
 
 def _read_text(data: bytes, header: Header) -> list[np.ndarray]:
-    lines = Lines(clean_text(data[header.body :]), header.lines + 1)
-    table = lines.run(0, header.points, "points").table()
+    text = Text(clean_text(data), header.body, header.lines + 1)
+    table = text.take(header.points, "points").table(each=POINT)
     width = sum(header.repeats)
     if len(table) and table.shape[1] != width:
         raise CloudFileError(
@@ -116,12 +116,15 @@ def _read_compressed(data: bytes, header: Header) -> list[np.ndarray]:
         raise CloudFileError(f"byte {len(data)}: the file ends before the compressed points")
     packed, unpacked = struct.unpack_from("<II", data, header.body)
     size = header.points * header.row_size
-    if start + packed > len(data) or unpacked != size or size > LARGEST_RATIO * packed:
+    if start + packed > len(data) or unpacked != size or size > _LARGEST_RATIO * packed:
         raise CloudFileError(
             f"byte {header.body}: {packed} bytes that unfold to {unpacked}, wanted {size} bytes "
             f"({header.points} points) from at most {len(data) - start}"
         )
-    raw = decompress(data, start, start + packed, size)
+    check_room(header.points, POINT + header.row_size, len(data), "points")
+    raw = _unfolded(data[start : start + packed], size)
+    if raw is None or len(raw) != size:
+        raise CloudFileError(f"byte {start}: the compressed points are damaged")
     values = []
     offset = 0
     for kind, repeat in zip(header.kinds, header.repeats, strict=True):
@@ -130,3 +133,17 @@ def _read_compressed(data: bytes, header: Header) -> list[np.ndarray]:
         values.append(part if repeat == 1 else part.reshape(header.points, repeat))
         offset += np.dtype(kind).itemsize * count
     return values
+
+
+def _unfolded(packed: bytes, size: int) -> bytes | None:
+    """What LZF compressed, by the library that has it; None for damaged bytes."""
+    try:
+        import lzf
+    except ImportError:
+        raise CloudFileError(
+            "compressed PCD needs the package python-neo-lzf: pip install python-neo-lzf"
+        ) from None
+    try:
+        return lzf.decompress(packed, size)
+    except ValueError:
+        return None

@@ -40,7 +40,7 @@ def read_binary(
                 columns.append(rows[f"{position}"])
             else:
                 sizes = rows[f"count {position}"]
-                columns.append(Ragged(rows[f"{position}"].ravel(), sizes))
+                columns.append(Ragged(rows[f"{position}"], sizes))
         held.append(columns)
     return held
 

@@ -7,8 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int64
 
+from cfr_jax.io.budget import POINT, check_room
 from cfr_jax.io.cloud import CloudFileError
-from cfr_jax.io.formats.text.lines import Lines, clean_text
+from cfr_jax.io.formats.text import lines
+from cfr_jax.io.formats.text.lines import Lines, Text
+from cfr_jax.io.growing import Growing
 
 # The types of the format, then those that programs write beside them.
 TYPES = {
@@ -62,16 +65,11 @@ class Element:
 
 @dataclass(frozen=True, eq=False)
 class Ragged:
-    """A list property: all numbers one after the other, and how many each row has."""
+    """A list property: all numbers one after the other, or a row for each list where these are
+    equally long; and how many each one has."""
 
     values: np.ndarray
     sizes: np.ndarray
-
-    @property
-    def starts(self) -> Int64[np.ndarray, " n"]:
-        """Where each row begins among the numbers."""
-        ends = np.cumsum(self.sizes, dtype=np.int64)
-        return ends - self.sizes
 
 
 # What an element holds, a property each; None for what was not asked for.
@@ -91,60 +89,75 @@ def read_text(
     data: bytes, body: int, elements: list[Element], whole: bool
 ) -> tuple[list[Held], list[str]]:
     """All elements of a text file, which gives each row a line, and notes."""
-    first = clean_text(data[:body]).count(b"\n") + 1
-    lines = Lines(clean_text(data[body:]), first)
+    text = Text(data, body, data.count(b"\n", 0, body) + 1)
     held: list[Held] = []
     notes: list[str] = []
-    taken = 0
     for element in elements:
         if not element.properties:
             held.append([])
             continue
-        rows = lines.run(taken, element.count, f"rows of element {element.name!r}")
-        taken += element.count
-        if element.has_lists:
-            held.append(_ragged(rows, element))
+        rows = text.take(element.count, f"rows of element {element.name!r}")
+        wanted = wanted_of(element, whole)
+        if not any(wanted):
+            held.append([None] * len(wanted))
             continue
-        table = rows.table()
+        if element.has_lists:
+            held.append(_ragged(rows, element, wanted))
+            continue
+        table = rows.table(each=POINT)
         if len(table) and table.shape[1] < len(element.properties):
-            _check_rows(np.zeros(1, bool), rows, element)
+            raise _too_few(rows.first, 0, element)
         if len(table) and table.shape[1] > len(element.properties):
             notes.append(
                 f"rows of element {element.name!r} have {table.shape[1]} numbers for "
                 f"{len(element.properties)} properties: left out the last ones"
             )
-        held.append(
-            [
-                table[:, column] if len(table) else np.empty(0)
-                for column in range(len(element.properties))
-            ]
-        )
+        columns = range(len(element.properties))
+        held.append([table[:, k] if len(table) else np.empty(0) for k in columns])
     if whole:
         held = [_typed(columns, element) for columns, element in zip(held, elements, strict=True)]
     return held, notes
 
 
-def _ragged(rows: Lines, element: Element) -> Held:
-    """The properties of an element with lists."""
-    values, position = rows.rows()
-    ends = np.append(position[1:], len(values))
-    found: Held = []
-    for prop in element.properties:  # one property of all rows at a time
-        _check_rows(position < ends, rows, element)
-        if prop.counter is None:
-            found.append(values[position])
+def _ragged(rows: Lines, element: Element, wanted: list[bool]) -> Held:
+    """The wanted properties of an element with lists."""
+    size = len(rows.data)
+    found = [
+        (Growing("f8" if prop.counter is None else prop.kind), Growing(prop.counter or "u1"))
+        for prop in element.properties
+    ]
+    done = 0
+    for block in rows.ragged():
+        values, ends = block.values, np.cumsum(block.counts)
+        position = ends - block.counts
+        for prop, needed, (parts, sizes) in zip(element.properties, wanted, found, strict=True):
+            _check_rows(position < ends, block, done, element)
+            if prop.counter is None:
+                if needed:
+                    parts.append(values[position])
+                position = position + 1
+                continue
+            lengths = values[position]
             position = position + 1
-            continue
-        lengths = values[position]
-        position = position + 1
-        # Also false for NaN, which no count may be.
-        fits = (lengths >= 0) & (lengths <= ends - position) & (lengths % 1 == 0)
-        _check_rows(fits, rows, element)
-        sizes = lengths.astype(np.int64)
-        found.append(Ragged(gathered(values, position, sizes), sizes))
-        position = position + sizes
-    _check_rows(position <= ends, rows, element)
-    return found
+            # Also false for NaN, which no count may be.
+            fits = (lengths >= 0) & (lengths <= ends - position) & (lengths % 1 == 0)
+            _check_rows(fits, block, done, element)
+            within = lengths.astype(np.int64)
+            if needed:
+                parts.append(gathered(values, position, within))
+                sizes.append(lengths)
+            position = position + within
+        done += len(block.counts)
+        check_room(sum(parts.nbytes + sizes.nbytes for parts, sizes in found), 1, size, "bytes")
+    held: Held = []
+    for prop, needed, (parts, sizes) in zip(element.properties, wanted, found, strict=True):
+        if not needed:
+            held.append(None)
+        elif prop.counter is None:
+            held.append(parts.joined())
+        else:
+            held.append(Ragged(parts.joined(), sizes.joined()))
+    return held
 
 
 def gathered(
@@ -178,12 +191,16 @@ def _cast(values: np.ndarray, kind: str) -> np.ndarray:
     return cast if same else values
 
 
-def _check_rows(good: np.ndarray, rows: Lines, element: Element) -> None:
+def _check_rows(good: np.ndarray, block: lines.Ragged, done: int, element: Element) -> None:
+    """Raises CloudFileError for the first row of a block, behind `done` others, that is not."""
     if not good.all():
         row = int(np.argmin(good))
-        line = rows.first + rows.data.count(b"\n", 0, int(rows.starts[row]))
-        names = ", ".join(prop.name for prop in element.properties)
-        raise CloudFileError(
-            f"line {line}: row {row} of element {element.name!r} has fewer numbers than its "
-            f"properties ({names:.80})"
-        )
+        raise _too_few(block.line(row), done + row, element)
+
+
+def _too_few(line: int, row: int, element: Element) -> CloudFileError:
+    names = ", ".join(prop.name for prop in element.properties)
+    return CloudFileError(
+        f"line {line}: row {row} of element {element.name!r} has fewer numbers than its "
+        f"properties ({names:.80})"
+    )

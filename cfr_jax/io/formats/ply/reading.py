@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-from cfr_jax.io.budget import check_room
+from cfr_jax.io.budget import check_room, check_surface
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.formats.ply.binary import read_binary
 from cfr_jax.io.formats.ply.elements import (
@@ -20,7 +20,7 @@ from cfr_jax.io.formats.ply.elements import (
     read_text,
 )
 from cfr_jax.io.formats.text.lines import clean_text
-from cfr_jax.io.mesh import Mesh, Polygons
+from cfr_jax.io.mesh import Mesh, Polygons, triangles_within
 from cfr_jax.io.table import table_of
 
 SOURCE = "PLY"
@@ -43,7 +43,7 @@ def parse(
     if order:
         held = read_binary(data, body, order, elements, whole)
     else:
-        held, notes = read_text(data, body, elements, whole)
+        held, notes = read_text(clean_text(data), body, elements, whole)
     names, values = [], []
     for prop, column in zip(elements[vertex].properties, held[vertex], strict=True):
         if column is not None and not isinstance(column, Ragged):
@@ -53,8 +53,7 @@ def parse(
     check_room(elements[vertex].count, each, len(data), "vertices")
     polygons = _polygons(elements, held)
     if polygons is not None:
-        corners = int(polygons[2].sum(dtype="i8"))
-        check_room(max(corners - 2 * len(polygons[2]), 0), 24, len(data), "triangles")
+        check_surface(elements[vertex].count, triangles_within(polygons[1]), len(data))
     try:
         table = table_of(
             names,
@@ -82,7 +81,7 @@ def _polygons(elements: list[Element], held: list[Held]) -> Polygons | None:
         if element.name == "face" and element.count and position is not None:
             lists = columns[position]
             if isinstance(lists, Ragged):
-                return lists.values, lists.starts, lists.sizes.astype("i8")
+                return lists.values, lists.sizes
     return None
 
 

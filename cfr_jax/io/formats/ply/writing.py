@@ -36,10 +36,10 @@ def save(stream: BinaryIO, cloud: PointCloud) -> list[str]:
         _write(stream, _again(table, vertices))
         return notes
     elements = [("vertex", vertices)]
-    if table.polygons is not None and len(table.polygons[2]):
-        values, _, sizes = table.polygons
+    if table.polygons is not None and len(table.polygons[1]):
+        values, sizes = table.polygons
         kind = "u1" if sizes.max() < 256 else "i4"
-        faces = Ragged(values.astype("<i4"), sizes.astype(kind))
+        faces = Ragged(values.astype("<i4").ravel(), sizes.astype(kind))
         elements.append(("face", [("vertex_indices", faces)]))
     _write(stream, elements)
     return notes
@@ -155,7 +155,7 @@ def _rows(columns: list[Column]) -> UInt8[np.ndarray, " bytes"]:
     for _, column in columns:
         if isinstance(column, Ragged):
             counter = column.sizes.astype("<" + _kind(column.sizes))
-            numbers = column.values.astype("<" + _kind(column.values))
+            numbers = column.values.astype("<" + _kind(column.values)).ravel()
             parts += [counter.view(np.uint8), numbers.view(np.uint8)]
             sizes = column.sizes.astype(np.int64)
             widths += [np.full(count, counter.itemsize), sizes * numbers.itemsize]

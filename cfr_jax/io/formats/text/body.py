@@ -13,10 +13,9 @@ from jaxtyping import Float64
 from cfr_jax.io.budget import check_room
 from cfr_jax.io.cloud import CloudFileError
 from cfr_jax.io.formats.text.dialect import Layout
-from cfr_jax.io.formats.text.lines import bad_line
+from cfr_jax.io.formats.text.lines import bad_line, without_comments
 
 _BLOCK = 1 << 20
-_COMMENT = re.compile(rb"(#|//)[^\n]*")
 _CANNOT = re.compile(r"could not convert string .* at row \d+, column (\d+)")
 
 
@@ -117,7 +116,7 @@ def blocks(data: bytes, layout: Layout) -> Iterator[tuple[int, bytes]]:
         if b"\r" in block:
             block = block.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
         if b"#" in block or b"//" in block:
-            block = _COMMENT.sub(b"", block)
+            block = without_comments(block, (b"#", b"//")).tobytes()
         if layout.commas_are_blanks:
             block = block.replace(b",", b" ")
         elif layout.decimal_comma:

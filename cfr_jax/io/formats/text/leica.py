@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from cfr_jax.io.budget import check_room
+from cfr_jax.io.budget import POINT, check_room
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.formats.text.body import read_numbers
 from cfr_jax.io.formats.text.dialect import decoded, layout_of
@@ -24,6 +24,8 @@ _NAMES = {
     7: ("x", "y", "z", "intensity", *_COLORS),
 }
 _PTX_HEADER = 10
+# How many scans there may be; each takes time, however few points it has.
+_SCANS, _BYTES_OF_A_SCAN = 500, 20_000
 
 
 def parse_pts(
@@ -50,9 +52,13 @@ def parse_ptx(
     text = decoded(data).replace(b"\r\n", b"\n")
     parts: list[np.ndarray] = []
     offset, line = 0, 1
+    taken = 0
     while text[offset : offset + 4096].strip():
-        part, offset, line = _scan(text, offset, line)
+        part, offset, line = _scan(text, offset, line, taken)
         parts.append(part)
+        taken += len(part)
+        if len(parts) > _SCANS + len(text) // _BYTES_OF_A_SCAN:
+            raise CloudFileError(f"line {line}: more than {len(parts)} scans of a few points each")
         if part.shape[1] != parts[0].shape[1]:
             raise CloudFileError(
                 f"line {line}: a scan of {part.shape[1]} columns after one of {parts[0].shape[1]}"
@@ -66,8 +72,11 @@ def parse_ptx(
     return table_of(names, list(rows.T), source="PTX").shape(name, (), whole)
 
 
-def _scan(text: bytes, offset: int, line: int) -> tuple[Float64[np.ndarray, "n c"], int, int]:
-    """The rows of a scan, and the offset and the number of the line behind it."""
+def _scan(
+    text: bytes, offset: int, line: int, taken: int
+) -> tuple[Float64[np.ndarray, "n c"], int, int]:
+    """The rows of a scan, and the offset and the number of the line behind it; `taken` rows came
+    before."""
     header: list[list[float]] = []
     for _ in range(_PTX_HEADER):
         end = text.find(b"\n", offset)
@@ -93,7 +102,8 @@ def _scan(text: bytes, offset: int, line: int) -> tuple[Float64[np.ndarray, "n c
     if count == 0 or body.count(b"\n") + (not body.endswith(b"\n")) < count:
         raise CloudFileError(f"line {line}: wanted {count} points, the file holds fewer")
     layout = replace(layout_of(body, ("x", "y", "z")), line=line)
-    check_room(count, 8 * layout.width + 48, len(text), "points")  # placed, and as a cloud
+    # placed, joined, and as a cloud
+    check_room(taken + count, 8 * layout.width + 2 * POINT, len(text), "points")
     rows = read_numbers(body, layout, None)
     if len(rows) != count or rows.shape[1] < 3:
         raise CloudFileError(f"line {line}: wanted {count} points, got {len(rows)}")

@@ -1,101 +1,211 @@
-"""Rows of numbers in text, read by numpy's parser; a mistake is told by its line."""
+"""Rows of numbers in text, read by numpy's parser block by block; a mistake is told by its line."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64, Int64, UInt8
 
+from cfr_jax.io.budget import check_room
 from cfr_jax.io.cloud import CloudFileError
 
-_BLANKS_TO_NEWLINES = bytes.maketrans(b" \t\v\f", b"\n\n\n\n")
+_BLANKS_TO_NEWLINES = bytes.maketrans(b" \t\v\f\r", b"\n\n\n\n\n")
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+_BLOCK = 1 << 19
+_LONGEST_LINE = 1 << 21
 
 
 def clean_text(data: bytes) -> bytes:
-    """Lines that end in a newline only, without a byte order mark; refuses binary bytes."""
+    """Lines that end in a newline, each at the byte where it was; refuses binary bytes."""
     if b"\0" in data:
         raise CloudFileError(f"byte {data.index(0)}: is zero, wanted text")
-    data = data.removeprefix(_BYTE_ORDER_MARK)
-    if b"\r" in data:
-        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if data.count(b"\r") > data.count(b"\r\n"):
+        data = data.replace(b"\r", b"\n")
     return data
+
+
+def behind_mark(data: bytes) -> int:
+    """Where the text begins: behind a byte order mark if there is one."""
+    return len(_BYTE_ORDER_MARK) if data.startswith(_BYTE_ORDER_MARK) else 0
+
+
+def without_comments(block: bytes, marks: tuple[bytes, ...] = (b"#",)) -> UInt8[np.ndarray, " k"]:
+    """The bytes of whole lines, with blanks for what stands behind a mark on a line."""
+    raw = np.frombuffer(block, np.uint8)
+    if not any(mark in block for mark in marks):
+        return raw
+    places = np.arange(len(raw), dtype=np.int32)
+    opens = np.zeros(len(raw), bool)
+    for mark in marks:
+        here = raw == mark[0]
+        if len(mark) == 2:
+            here[:-1] &= raw[1:] == mark[1]
+            here[-1:] = False
+        opens |= here
+    last_mark = np.maximum.accumulate(np.where(opens, places, -1))
+    last_newline = np.maximum.accumulate(np.where(raw == 10, places, -1))
+    return np.where(last_mark > last_newline, np.uint8(32), raw)
+
+
+@dataclass(frozen=True)
+class Ragged:
+    """All numbers of a block of lines, and how many each filled line has."""
+
+    values: Float64[np.ndarray, " k"]
+    counts: Int64[np.ndarray, " r"]
+    block: bytes
+    first: int
+
+    def line(self, row: int) -> int:
+        """The number of a row's line."""
+        return self.first + self.block.count(b"\n", 0, int(filled_starts(self.block)[row]))
 
 
 @dataclass(frozen=True)
 class Lines:
-    """The filled lines of a text, to be taken in runs; `first` is the number of the text's
-    first line within its file."""
+    """Filled lines of a text, from byte `begin` to `end`; `first` is the number of the first."""
 
     data: bytes
-    first: int = 1
+    begin: int
+    end: int
+    first: int
+    count: int
+    comments: bool = False
 
-    @cached_property
-    def starts(self) -> Int64[np.ndarray, " k"]:
-        """Byte offset of each line that is not blank."""
-        if not self.data:
-            return np.empty(0, np.int64)
-        raw = np.frombuffer(self.data, np.uint8)
-        starts = np.concatenate([[0], np.flatnonzero(raw == 10) + 1])
-        starts = starts[starts < len(raw)]
-        return starts[np.maximum.reduceat(raw, starts) > 32]
+    def table(self, each: int = 0) -> Float64[np.ndarray, "n c"]:
+        """All lines as rows with the same count of numbers.
 
-    def __len__(self) -> int:
-        return len(self.starts)
+        Raises CloudFileError also where these, and `each` bytes more for a row, would be too much.
+        """
+        table = np.empty((0, 0))
+        done = 0
+        for line, block in blocks(self.data, self.begin, self.end, self.first, self.comments):
+            rows = _load(block, line)
+            if not done:
+                width = rows.shape[1]
+                check_room(self.count, 8 * width + each, len(self.data), "rows")
+                table = np.empty((self.count, width))
+            elif rows.shape[1] != table.shape[1]:
+                raise CloudFileError(
+                    f"line {line}: the number of columns changed from {table.shape[1]} to "
+                    f"{rows.shape[1]}"
+                )
+            table[done : done + len(rows)] = rows
+            done += len(rows)
+        return table
 
-    def run(self, begin: int, count: int, what: str) -> Lines:
-        """Lines `begin` to `begin + count`; an error if they are not all there."""
-        if begin + count > len(self):
-            line = self.first + self.data.count(b"\n")
-            raise CloudFileError(
-                f"line {line}: the file ends after {len(self) - begin} of {count} {what}"
-            )
-        if count == 0:
-            return Lines(b"", self.first)
-        start = int(self.starts[begin])
-        end = int(self.starts[begin + count]) if begin + count < len(self) else len(self.data)
-        return Lines(self.data[start:end], self.first + self.data.count(b"\n", 0, start))
-
-    def table(
-        self, *, delimiter: str | None = None, columns: tuple[int, ...] | None = None
-    ) -> Float64[np.ndarray, "n c"]:
-        """All lines as rows with the same count of numbers."""
-        if not self.data.strip():
-            return np.empty((0, 0))
-        try:
-            return _load(self.data, delimiter, columns)
-        except ValueError as error:
-            where = self.first + bad_line(self.data, delimiter, columns)
-            raise CloudFileError(f"line {where}: {error}") from None
-
-    def rows(self) -> tuple[Float64[np.ndarray, " k"], Int64[np.ndarray, " r"]]:
-        """Rows with different counts of numbers: all numbers, and where each row starts."""
-        if not self.data.strip():
-            return np.empty(0), np.empty(0, np.int64)
-        try:
-            values = _load(self.data.translate(_BLANKS_TO_NEWLINES), None, None).ravel()
-        except ValueError as error:
-            where = self.first + bad_line(self.data, None, (0,))
-            raise CloudFileError(f"line {where}: {error}") from None
-        filled = np.frombuffer(self.data, np.uint8) > 32
-        filled[1:] &= ~filled[:-1]  # only the first byte of each number is left
-        return values, np.searchsorted(np.flatnonzero(filled), self.starts)
+    def ragged(self) -> Iterator[Ragged]:
+        """Rows with different counts of numbers, a block at a time."""
+        for line, block in blocks(self.data, self.begin, self.end, self.first, self.comments):
+            yield ragged(block, line)
 
 
-def _load(
-    data: bytes, delimiter: str | None, columns: tuple[int, ...] | None
-) -> Float64[np.ndarray, "n c"]:
-    return np.loadtxt(
-        io.BytesIO(data),
-        comments=None,
-        delimiter=delimiter,
-        usecols=columns,
-        ndmin=2,
-        encoding="latin1",
-    )
+class Text:
+    """A text whose filled lines are taken one after the other.
+
+    What follows a `#` is left out if there may be `comments`.
+    """
+
+    def __init__(
+        self, data: bytes, begin: int = 0, first: int = 1, *, comments: bool = False
+    ) -> None:
+        self._data, self._comments = data, comments
+        self._at, self._line = begin, first
+
+    def take(self, count: int, what: str) -> Lines:
+        """The next `count` filled lines; an error if they are not all there."""
+        begin, first, left = self._at, self._line, count
+        while left:
+            for line, block in blocks(self._data, self._at, None, self._line, self._comments):
+                starts = filled_starts(block)
+                if len(starts) > left:  # stops where the next filled line begins
+                    end = int(starts[left])
+                    self._at += end
+                    self._line = line + block.count(b"\n", 0, end)
+                    left = 0
+                    break
+                left -= len(starts)
+                self._at += len(block)
+                self._line = line + block.count(b"\n")
+                if not left:
+                    break
+            else:
+                raise CloudFileError(
+                    f"line {self._line}: the file ends after {count - left} of {count} {what}"
+                )
+        return Lines(self._data, begin, self._at, first, count, self._comments)
+
+    def left(self) -> int:
+        """How many filled lines there are from here on."""
+        found = blocks(self._data, self._at, None, self._line, self._comments)
+        return sum(len(filled_starts(block)) for _, block in found)
+
+
+def blocks(
+    data: bytes, begin: int, end: int | None, line: int, comments: bool = False
+) -> Iterator[tuple[int, bytes]]:
+    """Whole lines, about half a megabyte at a time, with the number of the first one."""
+    end = len(data) if end is None else end
+    while begin < end:
+        behind = block_end(data, begin, end, line)
+        block = data[begin:behind]
+        yield line, without_comments(block).tobytes() if comments else block
+        line += block.count(b"\n")
+        begin = behind
+
+
+def block_end(data: bytes, begin: int, end: int, line: int) -> int:
+    """Where a block of whole lines that begins at `begin` ends. Raises CloudFileError for a line
+    that is too long for one."""
+    if begin + _BLOCK >= end:
+        return end
+    newline = data.find(b"\n", begin + _BLOCK, min(end, begin + _BLOCK + _LONGEST_LINE))
+    if newline >= 0:
+        return newline + 1
+    if begin + _BLOCK + _LONGEST_LINE >= end:
+        return end
+    line += data.count(b"\n", begin, begin + _BLOCK)
+    raise CloudFileError(f"line {line}: is longer than {_LONGEST_LINE} bytes, the most we read")
+
+
+def filled_starts(block: bytes) -> Int64[np.ndarray, " k"]:
+    """Where lines that are not blank begin."""
+    raw = np.frombuffer(block, np.uint8)
+    starts = np.concatenate([[0], np.flatnonzero(raw[:-1] == 10) + 1])
+    return starts[np.maximum.reduceat(raw, starts) > 32]
+
+
+def ragged(block: bytes, line: int) -> Ragged:
+    """The numbers of a block of lines, of which `line` is the first."""
+    if not block.strip():
+        return Ragged(np.empty(0), np.empty(0, np.int64), block, line)
+    try:
+        values = _numbers(block.translate(_BLANKS_TO_NEWLINES))[:, 0]
+    except ValueError as error:
+        where = line + bad_line(block, None, (0,))
+        raise CloudFileError(f"line {where}: {error}") from None
+    filled = np.frombuffer(block, np.uint8) > 32
+    begins = filled.copy()
+    begins[1:] &= ~filled[:-1]  # only the first byte of each number is left
+    counts = np.add.reduceat(begins, filled_starts(block), dtype=np.int64)
+    return Ragged(values, counts, block, line)
+
+
+def _load(block: bytes, line: int) -> Float64[np.ndarray, "n c"]:
+    if not block.strip():
+        return np.empty((0, 0))
+    try:
+        return _numbers(block)
+    except ValueError as error:
+        where = line + bad_line(block, None, None)
+        raise CloudFileError(f"line {where}: {error}") from None
+
+
+def _numbers(block: bytes) -> Float64[np.ndarray, "n c"]:
+    return np.loadtxt(io.BytesIO(block), comments=None, ndmin=2, encoding="latin1")
 
 
 def bad_line(data: bytes, delimiter: str | None, columns: tuple[int, ...] | None) -> int:
