@@ -69,8 +69,9 @@ class Alignment:
 
     @property
     def trusted(self) -> bool:
-        """Whether the motion is determined and more likely right than wrong, and that is known."""
-        if self.confidence is None:
+        """Whether the motion is determined and more likely right than wrong, and that is known.
+        False where `alternatives` fit about as well."""
+        if self.confidence is None or len(self.alternatives):
             return False
         return self.determined and self.confidence >= doubts.TRUSTED
 
@@ -107,7 +108,9 @@ def answer(case: Case) -> Alignment:
     weakest = np.asarray(found.quality.weakest)[resistance.argmin()]
     fitness = float(found.quality.fitness)
     clues = confidence.named(found.clues)
-    probability = doubts.probability(calibration_of(case.params), clues, fitness)
+    probability = doubts.probability(
+        calibration_of(case.params), clues, fitness, fitness * len(plan.source.rows), len(rivals)
+    )
     neighbors = min(plan.source.neighbor_count, plan.target.neighbor_count)
     return Alignment(
         transform=transform,
@@ -133,6 +136,7 @@ def answer(case: Case) -> Alignment:
             neighbors,
             frames.size_ratio,
             far is not None,
+            plan.remarks,
         ),
         seconds=case.seconds,
         initial=initial,
