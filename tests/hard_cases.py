@@ -57,7 +57,9 @@ def drawn(kinds: tuple[str, ...], count: int, seed: int) -> Iterator[HardCase]:
 def turn(rng: np.random.Generator, most: float = 45.0) -> np.ndarray:
     """A motion of up to `most` degrees about each axis, as the network knows them."""
     motion = np.eye(4)
-    motion[:3, :3] = Rotation.from_euler("xyz", rng.uniform(-most, most, 3), degrees=True).as_matrix()
+    motion[:3, :3] = Rotation.from_euler(
+        "xyz", rng.uniform(-most, most, 3), degrees=True
+    ).as_matrix()
     motion[:3, 3] = rng.uniform(-0.5, 0.5, 3)
     return motion
 
@@ -129,7 +131,9 @@ def street(seed: int) -> Callable[[int, np.random.Generator], np.ndarray]:
         unit = rng.random((10, count // 40, 3)) * [4, 1.8, 1.5]
         unit[..., 1] = np.where(rng.random(unit.shape[:2]) < 0.5, 0, unit[..., 1])
         parts.append((cars[:, None] + unit).reshape(-1, 3))
-        parts.append((poles[:, None] + rng.random((12, count // 100, 3)) * [0.2, 0.2, 6]).reshape(-1, 3))
+        parts.append(
+            (poles[:, None] + rng.random((12, count // 100, 3)) * [0.2, 0.2, 6]).reshape(-1, 3)
+        )
         points = np.concatenate(parts)
         return points[rng.permutation(len(points))[:count]]
 
@@ -251,7 +255,7 @@ def low_overlap(kind: str, rng: np.random.Generator, number: int) -> HardCase:
     toward = rng.normal(size=3)
     source = case.source[np.argsort(case.source @ toward)[:500]]
     back = solids.move(np.linalg.inv(case.truth), case.target)
-    target = case.target[np.argsort(-back @ toward)[:500 + 50 * (number % 5)]]
+    target = case.target[np.argsort(-back @ toward)[: 500 + 50 * (number % 5)]]
     return HardCase(kind, source, target, case.truth, source, case.options)
 
 

@@ -7,7 +7,7 @@ network would believe them.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from cfr_jax.geometry.trees import Tree
 
@@ -32,7 +32,7 @@ def contradict(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3
 
     That is so if all are the same and the points lie on no plane across them; or if they neither
     agree with the principal components of neighborhoods nor stand across the directions to the
-    nearest points. False where the points do not tell, because there are fewer than 30 of them.
+    nearest points. False where the points do not tell: fewer than 30, or no surface among them.
 
     Signs are not judged: those of thin sheets, seen from both sides, look as if drawn at random.
     """
@@ -47,13 +47,14 @@ def contradict(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3
     offset = points[near] - points[near].mean(axis=1, keepdims=True)
     spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))
     flat = (spread[:, 0] <= _FLAT * spread[:, 1]) & (spread[:, 1] > 0)
-    across = axes[:, :, 0]
-    agreement = _typical(np.abs(np.sum(across * normals[asked], axis=1)), flat)
     away = points[near[:, 1 : 1 + _NEAREST]] - points[asked, None]
     distance = np.linalg.norm(away, axis=2)
     apart = distance > 0
+    if not flat.any() or not apart.any():
+        return False
+    agreement = np.abs(np.sum(axes[:, :, 0] * normals[asked], axis=1))
     cosines = np.abs(np.einsum("nki,ni->nk", away, normals[asked])) / np.where(apart, distance, 1)
-    return agreement < _AGREES and _typical(cosines, apart) > _STEEP
+    return bool(np.median(agreement[flat]) < _AGREES and np.median(cosines[apart]) > _STEEP)
 
 
 def _flat_across(points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, " 3"]) -> bool:
@@ -63,8 +64,3 @@ def _flat_across(points: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, " 3
 
     extent = max(width(points[:, axis]) for axis in range(3))
     return width(points @ normal) <= _THICKNESS * extent
-
-
-def _typical(values: Float[np.ndarray, "..."], told: Bool[np.ndarray, "..."]) -> float:
-    """The median of those that tell something; of none, 0.5, as of random directions."""
-    return float(np.median(values[told])) if told.any() else 0.5
