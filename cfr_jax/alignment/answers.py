@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from cfr_jax.alignment.case import Case
 from cfr_jax.networks.probability import calibration_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Alignment:
     """Answer of `align`; everything in the caller's frame and units.
 
@@ -66,6 +66,13 @@ class Alignment:
     """How many starts were tried, those of a second look included."""
     alternatives: Float[np.ndarray, "a 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """Other motions that a search found to fit about as well: the shape is nearly symmetric."""
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all but the `seconds` are equal, bit by bit."""
+        if not isinstance(other, Alignment):
+            return NotImplemented
+        names = (each.name for each in fields(self) if each.name != "seconds")
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
     @property
     def trusted(self) -> bool:

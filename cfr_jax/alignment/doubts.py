@@ -20,6 +20,10 @@ FREE = 0.08
 TRUSTED = 0.5
 _HARDLY = 0.2  # of the source on the target: too little to say what the shapes determine
 _INLIERS = 30.0  # 21 of them allow a confidence of 0.5, a hundred one of 0.96
+# How many of a unit make a meter.
+_PER_METER = {"millimeters": 1000.0, "centimeters": 100.0, "inches": 39.3701, "feet": 3.28084,
+              "meters": 1.0}  # fmt: skip
+_PARTS_APART = 2.0  # as views of one thing differ in radius, while units differ by ten or more
 _SIZES_APART = 5.0  # more than partial views of one thing differ in radius
 
 
@@ -42,7 +46,8 @@ def warnings_of(
         larger, smaller, times = "source", "target", size_ratio
         if size_ratio < 1:
             larger, smaller, times = "target", "source", 1 / size_ratio
-        warnings.append(f"the {larger} is {times:.3g} times as large as the {smaller}: same units?")
+        told = f"the {larger} is {times:.3g} times as large as the {smaller}: same units?"
+        warnings.append(told + _units_in_words(size_ratio))
     if fitness < _HARDLY:
         warnings.append(f"the clouds hardly meet: {fitness:.0%} of the source lies on the target")
     elif free is not None:
@@ -88,6 +93,22 @@ def probability(
     if fitness < _HARDLY:
         told = min(told, fitness)
     return min(told, 1 / (1 + rivals), 1 - math.exp(-inliers / _INLIERS))
+
+
+def _units_in_words(size_ratio: float) -> str:
+    """The units in which two clouds seem to be, with the factor that would make them one; empty
+    where no two usual units are so far apart."""
+    off, factor, ours, theirs = min(
+        (abs(math.log(size_ratio * theirs / ours)), theirs / ours, our_name, their_name)
+        for our_name, ours in _PER_METER.items()
+        for their_name, theirs in _PER_METER.items()
+    )
+    if off > math.log(_PARTS_APART):
+        return ""
+    return (
+        f" If the source is in {ours} and the target in {theirs}, "
+        f"multiply the source by {factor:.4g}"
+    )
 
 
 def turns(

@@ -74,6 +74,31 @@ def test_clouds_in_different_units_are_not_trusted(pair, scale):
     assert not found.trusted and np.isfinite(found.transform).all()
 
 
+@pytest.mark.parametrize(
+    ("ratio", "said"),
+    [
+        (1000.0, "source is in millimeters and the target in meters, multiply the source by 0.001"),
+        (830.0, "source is in millimeters and the target in meters, multiply the source by 0.001"),
+        (1e-3, "multiply the source by 1000"),
+        (
+            10.0,
+            "source is in millimeters and the target in centimeters, multiply the source by 0.1",
+        ),
+        (25.4, "source is in millimeters and the target in inches, multiply the source by 0.03937"),
+    ],
+)
+def test_units_that_would_fit_are_named_with_their_factor(ratio, said):
+    [told] = doubts.warnings_of(None, (), 0.9, 0.9, 64, ratio, False)
+
+    assert "same units?" in told and said in told
+
+
+def test_no_unit_is_named_where_none_fits():
+    [told] = doubts.warnings_of(None, (), 0.9, 0.9, 64, 1e-9, False)
+
+    assert told.endswith("same units?")
+
+
 def test_points_in_two_places_turn_freely_about_their_line():
     points = np.repeat([[0.0, 0, 0], [0, 2, 0]], 250, axis=0)
 
