@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from cfr_jax.alignment import confidence, doubts, quality, search, solving
+from cfr_jax.alignment import basins, confidence, doubts, quality, search, solving
 from cfr_jax.alignment.case import Case
 from cfr_jax.networks.probability import calibration_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Alignment:
     """Answer of `align`; everything in the caller's frame and units.
 
@@ -67,10 +67,18 @@ class Alignment:
     alternatives: Float[np.ndarray, "a 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """Other motions that a search found to fit about as well: the shape is nearly symmetric."""
 
+    def __eq__(self, other: object) -> bool:
+        """Whether all but the `seconds` are equal, bit by bit."""
+        if not isinstance(other, Alignment):
+            return NotImplemented
+        names = (each.name for each in fields(self) if each.name != "seconds")
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
+
     @property
     def trusted(self) -> bool:
-        """Whether the motion is determined and more likely right than wrong, and that is known."""
-        if self.confidence is None:
+        """Whether the motion is determined and more likely right than wrong, and that is known.
+        False where `alternatives` fit about as well."""
+        if self.confidence is None or len(self.alternatives):
             return False
         return self.determined and self.confidence >= doubts.TRUSTED
 
@@ -102,12 +110,12 @@ def answer(case: Case) -> Alignment:
     initial = None if np.array_equal(frames.initial, np.eye(4)) else frames.initial
     far = None if searched is None or searched.nearby else searched
     rivals = np.zeros((0, 4, 4)) if far is None else search.rivals(far, transform)
-    resistance = np.asarray(found.quality.resistance)
-    determined = bool(resistance.min() >= doubts.FREE)
-    weakest = np.asarray(found.quality.weakest)[resistance.argmin()]
     fitness = float(found.quality.fitness)
     clues = confidence.named(found.clues)
-    probability = doubts.probability(calibration_of(case.params), clues, fitness)
+    probability = doubts.probability(
+        calibration_of(case.params), clues, fitness, fitness * len(plan.source.rows), len(rivals)
+    )
+    free = left_open(case, probability)
     neighbors = min(plan.source.neighbor_count, plan.target.neighbor_count)
     return Alignment(
         transform=transform,
@@ -117,7 +125,7 @@ def answer(case: Case) -> Alignment:
         steps=int(found.steps),
         confidence=probability,
         clues=clues,
-        determined=determined,
+        determined=free is None,
         fitness=fitness,
         inlier_rmse=float(found.quality.inlier_rmse) * frames.scale,
         inlier_distance=solving.DISTANCE * frames.scale,
@@ -126,13 +134,14 @@ def answer(case: Case) -> Alignment:
         target_rows=plan.target.rows,
         neighbors=neighbors,
         warnings=doubts.warnings_of(
-            None if determined else weakest,
+            free,
             doubts.turns(transform, rivals),
             probability,
             fitness,
             neighbors,
             frames.size_ratio,
             far is not None,
+            plan.remarks,
         ),
         seconds=case.seconds,
         initial=initial,
@@ -143,3 +152,27 @@ def answer(case: Case) -> Alignment:
             np.asarray(found.quality.moments), frames.target_center, frames.scale
         ),
     )
+
+
+def left_open(case: Case, probability: float | None) -> Float[np.ndarray, " 6"] | None:
+    """The twist that the clouds do not determine, if there is one.
+
+    What a nudge of usual size finds free is asked again with one that fits the clouds. What would
+    be trusted is also turned far (`basins.free_turn`).
+    """
+    found, plan = case.solved(), case.plan
+    resistance = np.asarray(found.quality.resistance, np.float64)
+    twists, transform = (
+        np.asarray(value, np.float64) for value in (found.quality.weakest, found.transform)
+    )
+    source, target = (
+        unit.points[unit.mask].astype(np.float64) for unit in (plan.source, plan.target)
+    )
+    free = resistance < doubts.FREE
+    if free.any():
+        resistance[free] = basins.resistance(source, target, transform, twists[free])
+    if resistance.min() < doubts.FREE:
+        return twists[resistance.argmin()]
+    if probability is None or probability < doubts.TRUSTED:
+        return None
+    return basins.free_turn(source, target, transform)

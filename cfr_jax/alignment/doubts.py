@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -18,6 +19,11 @@ from cfr_jax.networks.probability import Calibration
 FREE = 0.08
 TRUSTED = 0.5
 _HARDLY = 0.2  # of the source on the target: too little to say what the shapes determine
+_INLIERS = 30.0  # 21 of them allow a confidence of 0.5, a hundred one of 0.96
+# How many of a unit make a meter.
+_PER_METER = {"millimeters": 1000.0, "centimeters": 100.0, "inches": 39.3701, "feet": 3.28084,
+              "meters": 1.0}  # fmt: skip
+_PARTS_APART = 2.0  # as views of one thing differ in radius, while units differ by ten or more
 _SIZES_APART = 5.0  # more than partial views of one thing differ in radius
 
 
@@ -29,17 +35,19 @@ def warnings_of(
     neighbors: int,
     size_ratio: float,
     searched: bool,
+    remarks: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """`free` is the twist that nothing determines, if there is one; `rivals` are the turns by which
     other answers differ (`turns`); `probability` is None where the weights have no calibration;
     `size_ratio` is the radius of the source over the target's; `searched` tells whether more than
-    one start was tried."""
-    warnings = []
+    one start was tried; `remarks` are what was said before (`Plan.remarks`)."""
+    warnings = list(remarks)
     if not 1 / _SIZES_APART < size_ratio < _SIZES_APART:
         larger, smaller, times = "source", "target", size_ratio
         if size_ratio < 1:
             larger, smaller, times = "target", "source", 1 / size_ratio
-        warnings.append(f"the {larger} is {times:.3g} times as large as the {smaller}: same units?")
+        told = f"the {larger} is {times:.3g} times as large as the {smaller}: same units?"
+        warnings.append(told + _units_in_words(size_ratio))
     if fitness < _HARDLY:
         warnings.append(f"the clouds hardly meet: {fitness:.0%} of the source lies on the target")
     elif free is not None:
@@ -65,12 +73,42 @@ def warnings_of(
 
 
 def probability(
-    fitted: Calibration | None, clues: Mapping[str, float], fitness: float
+    fitted: Calibration | None,
+    clues: Mapping[str, float],
+    fitness: float,
+    inliers: float = math.inf,
+    rivals: int = 0,
 ) -> float | None:
-    """That the answer is right: no greater than the fitness where the clouds hardly meet. Those it
-    was fitted to did, and it says nothing of others. None without calibration."""
+    """That the answer is right: what the calibration says, but no more than can be known. None
+    without calibration.
+
+    It was fitted to clouds that meet, of hundreds of points and without rivals, and says nothing of
+    others. So three bounds hold beside it: the fitness, where the clouds hardly meet; 1/(1 + r) of
+    r rivals, which are as likely right; and 1 - exp(-n / 30) of n `inliers` (points of the source
+    that lie on the target), because a few points of noise can always be laid on a few others.
+    """
     told = confidence.of_alignment(fitted, clues)
-    return told if told is None or fitness >= _HARDLY else min(told, fitness)
+    if told is None:
+        return None
+    if fitness < _HARDLY:
+        told = min(told, fitness)
+    return min(told, 1 / (1 + rivals), 1 - math.exp(-inliers / _INLIERS))
+
+
+def _units_in_words(size_ratio: float) -> str:
+    """The units in which two clouds seem to be, with the factor that would make them one; empty
+    where no two usual units are so far apart."""
+    off, factor, ours, theirs = min(
+        (abs(math.log(size_ratio * theirs / ours)), theirs / ours, our_name, their_name)
+        for our_name, ours in _PER_METER.items()
+        for their_name, theirs in _PER_METER.items()
+    )
+    if off > math.log(_PARTS_APART):
+        return ""
+    return (
+        f" If the source is in {ours} and the target in {theirs}, "
+        f"multiply the source by {factor:.4g}"
+    )
 
 
 def turns(

@@ -12,12 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from cfr_jax.alignment import starts
-from cfr_jax.geometry import motions, units
+from cfr_jax.geometry import motions, plausible, units
 from cfr_jax.io import PointCloud, as_point_cloud
 from cfr_jax.networks.inputs import Settings
 
 DEFAULT_BUDGET = 1024
 SETTINGS = Settings()
+_SAMPLED = 2048  # points that show whether many come again and again
 CASCADES = 2  # chosen on validation pairs (docs/training.md)
 
 
@@ -41,6 +42,8 @@ class Plan:
     start that there is has been made part of `frames`."""
     whole: tuple[PointCloud, PointCloud] | None = None
     """The caller's clouds with all their points, where they are asked for."""
+    remarks: tuple[str, ...] = ()
+    """What was done differently when the clouds were made ready, in words."""
 
     @property
     def thinned(self) -> bool:
@@ -68,6 +71,8 @@ class Plan:
 
 def read_clouds(source: Any, target: Any) -> tuple[PointCloud, PointCloud]:
     """Both as clouds; raises ValueError, by name, for what is none or has too few points."""
+    for cloud, name in ((source, "source"), (target, "target")):
+        refuse_masked(name, cloud)
     clouds = as_point_cloud(source, name="source"), as_point_cloud(target, name="target")
     for cloud, name in zip(clouds, ("source", "target"), strict=True):
         if len(cloud.points) < 3:
@@ -92,7 +97,7 @@ def planned(
     The plan keeps the `whole` clouds on demand. Without `search` it leaves the search for
     neighbors to the device. `to_unit` may stand in for `units.to_unit`, and remember what it made.
     """
-    source, target = read_clouds(source, target)
+    (source, target), remarks = _without_wrong_normals(read_clouds(source, target))
     everywhere = isinstance(initial, str) and initial in ("global", "auto")
     given = None if initial is None or everywhere else rigid_motions(initial)
     start = given[0] if given is not None and len(given) == 1 else None
@@ -123,6 +128,7 @@ def planned(
             (target, frames.target_center, np.eye(4)),
         )
     )
+    remarks += _strays_in_words(frames, source, target)
     return Plan(
         frames,
         unit_source,
@@ -131,7 +137,53 @@ def planned(
         start_given=given is not None,
         if_doubted=everywhere and initial == "auto",
         starts=several,
-        whole=(source, target) if whole else None,
+        whole=(_each_place_once(source), _each_place_once(target)) if whole else None,
+        remarks=remarks,
+    )
+
+
+def refuse_masked(name: str, cloud: Any) -> None:
+    """Raises ValueError for an array of numpy with masked values: what lies under the mask is no
+    point, and the array alone does not tell whether its row may be left out."""
+    if isinstance(cloud, np.ma.MaskedArray) and np.ma.is_masked(cloud):
+        raise ValueError(
+            f"{name}: got an array with {np.ma.count_masked(cloud)} masked values, wanted an array "
+            "without (leave their rows out)"
+        )
+
+
+def _without_wrong_normals(
+    clouds: tuple[PointCloud, PointCloud],
+) -> tuple[tuple[PointCloud, PointCloud], tuple[str, ...]]:
+    """The clouds, without normals that contradict their points, and what is to be said of it."""
+    kept, remarks = [], []
+    for cloud, name in zip(clouds, ("source", "target"), strict=True):
+        if cloud.normals is not None and plausible.contradict(cloud.points, cloud.normals):
+            cloud = dataclasses.replace(cloud, normals=None)
+            remarks.append(
+                f"the normals of the {name} contradict its points (placeholders, colors?): "
+                "estimated from the points instead"
+            )
+        kept.append(cloud)
+    return (kept[0], kept[1]), tuple(remarks)
+
+
+def _each_place_once(cloud: PointCloud) -> PointCloud:
+    """A cloud in which many points come again and again, with each of them once; else itself."""
+    rows = np.random.default_rng(0).permutation(len(cloud.points))[:_SAMPLED]
+    if not units.repeated(cloud.points[rows]):
+        return cloud
+    rows = units.first_of_each_place(cloud.points)
+    normals = None if cloud.normals is None else cloud.normals[rows]
+    return dataclasses.replace(cloud, points=cloud.points[rows], normals=normals)
+
+
+def _strays_in_words(frames: units.Frames, *clouds: PointCloud) -> tuple[str, ...]:
+    return tuple(
+        f"{count} of the {len(cloud.points)} points of the {name} lie far out and are not used: "
+        "more than four radii of the others"
+        for count, cloud, name in zip(frames.strays, clouds, ("source", "target"), strict=True)
+        if count
     )
 
 

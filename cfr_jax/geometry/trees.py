@@ -59,9 +59,14 @@ class Tree:
 
     @functools.cached_property
     def spacing(self) -> float:
-        """Median distance of a point to the nearest other point; of a sample of large clouds."""
+        """Median distance of a point to the nearest other point; of a sample of large clouds.
+        Points that come several times count once, where most of them do."""
         sample = self.points[:: -(-len(self.points) // _SAMPLED)]
-        return float(np.median(self.nearest(sample, 2)[1][:, 1]))
+        found = float(np.median(self.nearest(sample, 2)[1][:, 1]))
+        if found > 0:
+            return found
+        places = np.unique(self.points, axis=0)
+        return Tree(places).spacing if 1 < len(places) < len(self.points) else found
 
 
 def cores() -> int:

@@ -8,6 +8,7 @@ size.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -25,6 +26,12 @@ _BUCKETS = tuple(
 )
 _OUTER = 0.995  # this share of the points lies in the unit sphere; stray points may lie outside
 _STRAY = 4.0  # points farther out are sensor errors and would dominate the network's input
+# What lies beyond a gap in the distances, each point this many times as far out as the one before,
+# has no part in the size of a cloud, if that is no more than this share of the points. Without a
+# gap, this many median distances are the limit: LiDAR scans reach ten of them.
+_GAP, _FEW, _MEDIANS = 4.0, 0.05, 30.0
+# Where fewer of the used points than this share differ, each place is used once.
+_DIFFERENT = 0.9
 FARTHEST = 1e3  # largest distance between the clouds, in radii; float32 resolves it with ease
 
 
@@ -39,6 +46,8 @@ class Frames:
     """Applied to the caller's source before it is centered."""
     size_ratio: float
     """Radius of the source divided by the radius of the target."""
+    strays: tuple[int, int] = (0, 0)
+    """How many points of the source and of the target lie more than four of their radii out."""
 
     def to_caller(self, transforms: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
         """Converts motions between the unit clouds to motions of the caller's source onto the
@@ -85,12 +94,14 @@ def unit_frames(
     between them. With one, both are placed relative to the target's centroid. Raises ValueError for
     a cloud without extent and for an initial motion that leaves the clouds far apart.
     """
-    (source_center, source_radius), (target_center, target_radius) = (
+    ours, theirs = (
         _ball(name, cloud.points) for name, cloud in (("source", source), ("target", target))
     )
-    scale, ratio = max(source_radius, target_radius), source_radius / target_radius
+    source_center, target_center = ours.center, theirs.center
+    scale, ratio = max(ours.radius, theirs.radius), ours.radius / theirs.radius
+    strays = ours.strays, theirs.strays
     if initial is None:
-        return Frames(source_center, target_center, scale, np.eye(4), ratio)
+        return Frames(source_center, target_center, scale, np.eye(4), ratio, strays)
     place = motions.apply(initial, source_center)
     away = float(np.abs(place - target_center).max())
     if not away <= FARTHEST * scale:
@@ -102,7 +113,7 @@ def unit_frames(
     # about the source's center: about a distant origin, the slightest turn would move the cloud.
     turn = motions.nearest_rotation(initial[:3, :3])
     exact = motions.motion(turn, place - turn @ source_center)
-    return Frames(target_center, target_center, scale, exact, ratio)
+    return Frames(target_center, target_center, scale, exact, ratio, strays)
 
 
 def to_unit(
@@ -119,13 +130,18 @@ def to_unit(
 ) -> UnitCloud:
     """At most `budget` points of `cloud`, moved, centered, scaled and padded.
 
-    Stray points, more than four radii from the median, are left out. The neighbors are found here,
-    unless `search` is false: an accelerator finds them faster.
+    Stray points, more than four radii from the median, are left out. Where many points lie in the
+    same places, each place is used once. The neighbors are found here, unless `search` is false: an
+    accelerator finds them faster.
     """
     points = (motions.apply(motion, cloud.points) - center) / scale
     near = np.linalg.norm(points - np.median(points, axis=0), axis=1) <= _STRAY
     rows = np.flatnonzero(near)
-    rows = rows[subsample(points[rows], budget, seed)]
+    used_rows = rows[subsample(points[rows], budget, seed)]
+    if repeated(cloud.points[used_rows]):
+        places = rows[first_of_each_place(cloud.points[rows])]
+        used_rows = places[subsample(points[places], budget, seed)]
+    rows = used_rows
     used = points[rows].astype(np.float32)
     count = len(used)
     size = bucket(count) if count > neighbors else count
@@ -185,23 +201,64 @@ def subsample(points: Float[np.ndarray, "n 3"], budget: int, seed: int) -> Int[n
     return np.sort(order[rng.permutation(chosen)[:budget]])
 
 
+def repeated(points: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether many of the points lie in the same places, and these are enough for a cloud."""
+    places = len(first_of_each_place(points))
+    return 3 <= places < _DIFFERENT * len(points)
+
+
+def first_of_each_place(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " m"]:
+    """Rows, in order, without those whose point is equal to that of an earlier row."""
+    order = np.lexsort(points.T)  # stable: equal points stay in the order of their rows
+    new = np.ones(len(points), bool)
+    new[1:] = (points[order[1:]] != points[order[:-1]]).any(axis=1)
+    return np.sort(order[new])
+
+
 def bucket(count: int) -> int:
     """The size that a cloud of `count` points is padded to."""
     return next((size for size in _BUCKETS if size >= count), count)
 
 
-def _ball(name: str, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
+class _Ball(NamedTuple):
+    center: Float[np.ndarray, " 3"]
+    radius: float
+    strays: int
+    """Points more than four radii out."""
+
+
+def _ball(name: str, points: Float[np.ndarray, "n 3"]) -> _Ball:
     """Center and radius of a cloud without its stray points, which would pull a plain mean away."""
-    center = points.mean(axis=0)
-    away = np.linalg.norm(points - center, axis=1)
-    center = points[away <= np.quantile(away, _OUTER, method="higher")].mean(axis=0)
-    radius = float(np.quantile(np.linalg.norm(points - center, axis=1), _OUTER))
-    if not radius > 1e-9 * np.abs(points).max():
+    kept = points[_gathered(points)]
+    center = kept.mean(axis=0)
+    away = np.linalg.norm(kept - center, axis=1)
+    center = kept[away <= np.quantile(away, _OUTER, method="higher")].mean(axis=0)
+    radius = float(np.quantile(np.linalg.norm(kept - center, axis=1), _OUTER))
+    if not radius > 1e-9 * np.abs(kept).max():
         raise ValueError(
             f"{name}: all of its {len(points)} points lie in one place, "
             "wanted a cloud with some extent"
         )
-    return center, radius
+    out = np.linalg.norm(points - center, axis=1) > _STRAY * radius
+    return _Ball(center, radius, int(np.count_nonzero(out)))
+
+
+def _gathered(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Which points are not so far out that they would hide the extent of the others.
+
+    The median of the points, and the median of their distances to it, stay where they are as long
+    as most points are good; a quantile of 0.995 is lost to one percent of stray points.
+    """
+    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    ordered = np.sort(away)
+    middle, few = ordered[len(points) // 2], int(_FEW * len(points))
+    tail = ordered[len(points) - 1 - few :]
+    if not tail[0] >= middle > 0:  # most points lie in one place, and the others are the extent
+        return np.ones(len(points), bool)
+    gaps = np.flatnonzero(tail[1:] > _GAP * tail[:-1])
+    last = tail[gaps[0]] if len(gaps) else tail[-1]
+    within = tail <= min(last, _MEDIANS * middle)
+    return away <= tail[within][-1] if within.any() else np.ones(len(points), bool)
 
 
 def _first_of_each_voxel(points: Float[np.ndarray, "n 3"], voxel: float) -> Int[np.ndarray, " m"]:

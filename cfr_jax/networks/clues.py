@@ -15,6 +15,7 @@ from cfr_jax.geometry import rigid
 from cfr_jax.networks.probability import SURE, Calibration, logit
 
 _HIGHEST = lax.Precision.HIGHEST
+_SMALLEST, _LARGEST = 0.2, 1.5  # root mean square radii of clouds of about unit size, and no other
 
 
 @struct.dataclass
@@ -75,12 +76,31 @@ def of_network(
     )
 
 
-def of_registration(fitted: Calibration | None, clues: NetworkClues) -> Float[Array, ""] | None:
-    """Probability in [0, 1] that the network's own answer is right; None without a calibration."""
+def of_registration(
+    fitted: Calibration | None, clues: NetworkClues, size: Float[Array, ""] | None = None
+) -> Float[Array, ""] | None:
+    """Probability in [0, 1] that the network's own answer is right; None without a calibration.
+
+    The network and the calibration know clouds of unit size. The further the `size` of the larger
+    cloud (`root_mean_square`) lies from theirs, the less is believed: half at 0.1 and at 3.
+    """
     if fitted is None:
         return None
     sure = logit(fitted.register, vars(clues))
-    return 1 / (1 + jnp.exp(-jnp.clip(sure, -SURE, SURE)))
+    told = 1 / (1 + jnp.exp(-jnp.clip(sure, -SURE, SURE)))
+    if size is None:
+        return told
+    return jnp.minimum(told, jnp.minimum(size / _SMALLEST, _LARGEST / jnp.maximum(size, _SMALLEST)))
+
+
+def root_mean_square(
+    points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
+) -> Float[Array, ""]:
+    """Distance of the points from their centroid, in the root mean square. About 0.5 for clouds in
+    the unit sphere."""
+    center = jnp.stack([_mean(points[:, axis], mask) for axis in range(3)])
+    # a tiny number, so that points in one place have a finite slope
+    return jnp.sqrt(_mean(jnp.sum((points - center) ** 2, axis=1), mask) + 1e-12)
 
 
 def _mean(values: Array, mask: Array | None) -> Array:

@@ -3,6 +3,7 @@
 Nearly all clouds here have 417 to 512 points, so that one compiled program serves them.
 """
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -173,6 +174,16 @@ def test_the_same_call_gives_the_same_bits(pair, answer):
     assert np.array_equal(again.transform, answer.transform)
     assert np.array_equal(again.weights, answer.weights)
     assert again.confidence == answer.confidence
+    assert again == answer and not again != answer
+
+
+def test_answers_that_differ_anywhere_but_in_the_time_are_not_equal(answer):
+    slower = dataclasses.replace(answer, seconds={"run": 1e9})
+
+    assert slower == answer
+    assert dataclasses.replace(answer, starts=2) != answer
+    assert dataclasses.replace(answer, transform=2 * answer.transform) != answer
+    assert answer != "an answer"
 
 
 def test_a_fresh_process_gives_the_same_bits(tmp_path):

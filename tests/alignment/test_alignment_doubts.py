@@ -1,11 +1,14 @@
 """What `align` finds but does not trust: shapes that move freely, different things, few points."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import solids
 
 from cfr_jax.alignment import doubts
 from cfr_jax.alignment.align import align
+from cfr_jax.io import PointCloud
 from cfr_jax.networks.probability import calibration_of
 from cfr_jax.weights.files import load_params
 
@@ -71,6 +74,31 @@ def test_clouds_in_different_units_are_not_trusted(pair, scale):
     assert not found.trusted and np.isfinite(found.transform).all()
 
 
+@pytest.mark.parametrize(
+    ("ratio", "said"),
+    [
+        (1000.0, "source is in millimeters and the target in meters, multiply the source by 0.001"),
+        (830.0, "source is in millimeters and the target in meters, multiply the source by 0.001"),
+        (1e-3, "multiply the source by 1000"),
+        (
+            10.0,
+            "source is in millimeters and the target in centimeters, multiply the source by 0.1",
+        ),
+        (25.4, "source is in millimeters and the target in inches, multiply the source by 0.03937"),
+    ],
+)
+def test_units_that_would_fit_are_named_with_their_factor(ratio, said):
+    [told] = doubts.warnings_of(None, (), 0.9, 0.9, 64, ratio, False)
+
+    assert "same units?" in told and said in told
+
+
+def test_no_unit_is_named_where_none_fits():
+    [told] = doubts.warnings_of(None, (), 0.9, 0.9, 64, 1e-9, False)
+
+    assert told.endswith("same units?")
+
+
 def test_points_in_two_places_turn_freely_about_their_line():
     points = np.repeat([[0.0, 0, 0], [0, 2, 0]], 250, axis=0)
 
@@ -101,6 +129,44 @@ def test_where_clouds_hardly_meet_the_fitness_bounds_the_confidence():
     assert doubts.probability(fitted, sure, 0.6) == pytest.approx(0.99, abs=1e-3)
     assert doubts.probability(fitted, sure, 0.1) == 0.1
     assert doubts.probability(fitted, unsure, 0.1) == pytest.approx(0.052, abs=1e-3)
+
+
+def test_rivals_and_few_inliers_bound_the_confidence():
+    fitted = calibration_of(load_params())
+    weights = dict(fitted.align)
+    sure = dict.fromkeys(weights, 0.0) | {"settled": (4.6 - weights["bias"]) / weights["settled"]}
+
+    told = [doubts.probability(fitted, sure, 0.6, 500.0, rivals) for rivals in range(3)]
+    few, more = (doubts.probability(fitted, sure, 0.6, inliers) for inliers in (10.0, 40.0))
+
+    assert told == pytest.approx([0.99, 1 / 2, 1 / 3], abs=1e-3)
+    assert few == pytest.approx(1 - np.exp(-1 / 3)) and few < doubts.TRUSTED < more < 0.75
+
+
+def test_an_answer_with_rivals_is_not_trusted(pair):
+    found = align(*pair)
+
+    assert found.trusted
+    assert not dataclasses.replace(found, alternatives=np.eye(4)[None]).trusted
+
+
+def test_placeholder_normals_are_dropped_and_that_is_said(pair):
+    with_normals = (PointCloud(points, np.tile([0.0, 0, 1], (500, 1))) for points in pair)
+
+    found = align(*with_normals)
+
+    assert np.array_equal(found.transform, align(*pair).transform)
+    assert sum("contradict its points" in text for text in found.warnings) == 2
+
+
+def test_points_far_out_are_counted(pair):
+    spoiled = pair[0].copy()
+    spoiled[::50] *= 400
+
+    found = align(spoiled, pair[1])
+
+    assert "10 of the 500 points of the source lie far out" in found.warnings[0]
+    assert solids.degrees_between(found.transform, TRUTH) < 2
 
 
 def test_who_tried_one_start_is_told_of_the_search():

@@ -33,6 +33,7 @@ def spoiled(value):
         (None, "NoneType"),
         (np.ones((50, 3)), "lie in one place"),
         ("nowhere.ply", "nowhere.ply"),
+        (np.ma.masked_greater(CLOUD, 0.9), "masked values, wanted an array without"),
     ],
 )
 @pytest.mark.parametrize("name", ["source", "target"])

@@ -6,6 +6,7 @@ import solids
 from scipy.spatial import cKDTree
 
 from cfr_jax.geometry import units
+from cfr_jax.geometry.trees import Tree
 from cfr_jax.geometry.units import bucket, subsample, to_unit, unit_frames
 from cfr_jax.io import PointCloud
 
@@ -200,3 +201,44 @@ def test_a_cloud_without_extent_is_refused_by_name(at):
 
     with pytest.raises(ValueError, match="^target: all of its 50 points lie in one place"):
         unit_frames(cloud, spot, None)
+
+
+@pytest.mark.parametrize("share", [0.006, 0.02, 0.045])
+def test_points_far_out_do_not_decide_the_size(share):
+    points = solids.lopsided(1000, 0).points
+    count = int(share * len(points))
+    rng = np.random.default_rng(0)
+    spoiled = points.copy()
+    spoiled[:count] = rng.uniform(200, 1000, (count, 1)) * solids.sphere(count, 0).points
+
+    clean, found = (unit_frames(PointCloud(p), PointCloud(p), None) for p in (points, spoiled))
+
+    assert found.scale == pytest.approx(clean.scale, rel=0.03)
+    np.testing.assert_allclose(found.source_center, clean.source_center, atol=0.03)
+    assert found.strays == (count, count) and clean.strays == (0, 0)
+
+
+def test_a_scan_that_thins_out_toward_its_edge_is_kept_whole():
+    rng = np.random.default_rng(0)
+    away = 2 * np.exp(rng.random(5000) * np.log(40))  # 2 to 80 m: forty to one
+    points = away[:, None] * solids.sphere(5000, 0).points * [1, 1, 0.02]
+
+    assert units._gathered(points).all()
+
+
+def test_each_place_counts_once_where_points_come_again_and_again():
+    points = solids.lopsided(300, 0).points
+    cloud = PointCloud(np.repeat(points, 20, axis=0))
+    frames = unit_frames(cloud, cloud, None)
+
+    found = unit(cloud, frames, frames.source_center)
+
+    assert found.rows.tolist() == list(range(0, 6000, 20))
+    assert Tree(cloud.points).spacing == pytest.approx(Tree(points).spacing)
+
+
+def test_the_first_row_of_each_place_is_numpys():
+    points = np.random.default_rng(0).integers(0, 3, (200, 3)).astype(float)
+
+    wanted = np.sort(np.unique(points, axis=0, return_index=True)[1])
+    assert units.first_of_each_place(points).tolist() == wanted.tolist()

@@ -9,19 +9,23 @@ from __future__ import annotations
 
 import functools
 from numbers import Integral
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import lax
 from jaxtyping import Array, Float
 
 from cfr_jax.geometry import rigid
+from cfr_jax.networks.cfr.checks import checked, refuse_unless
 from cfr_jax.networks.cfr.iterations import Encoded, encoded, iterate, iterations_of, moved_on
 from cfr_jax.networks.cfr.network import check_params
-from cfr_jax.networks.clues import NetworkClues, of_network, of_registration
+from cfr_jax.networks.clues import (
+    NetworkClues,
+    of_network,
+    of_registration,
+    root_mean_square,
+)
 from cfr_jax.networks.inputs import Cloud, Settings, check_points, prepare
 from cfr_jax.networks.probability import calibration_of
 from cfr_jax.networks.record import Params
@@ -48,7 +52,8 @@ class Registration:
     """What the confidence was estimated from."""
     confidence: Float[Array, ""] | None
     """Estimated probability, in [0, 1], that `transform` is right to within 5 degrees and 0.1. It
-    holds for clouds of unit size and one cascade. None if the parameters have no calibration."""
+    holds for clouds of unit size and one cascade, and falls to zero for much smaller and larger
+    ones. None if the parameters have no calibration."""
 
     @property
     def transform(self) -> Float[Array, "*batch 4 4"]:
@@ -66,9 +71,9 @@ def encode(
     """
     check_params(params)
     clouds = {"target": target}
-    finite = _checked(clouds)
+    usable = checked(clouds)
     encoded = _encode(params, target, settings=settings)
-    _refuse_unless(finite, clouds)
+    refuse_unless(usable, clouds)
     return encoded
 
 
@@ -100,19 +105,20 @@ def register(
     target.
 
     Gradients flow through everything but the choice of neighbors. Raises ValueError for wrong
-    shapes and for values that are not finite. Inside `jit` and `vmap` the values are not known, and
-    NaN in gives NaN out.
+    shapes, for masked arrays with masked values, and for values that are not finite or lie so far
+    out that float32 cannot tell points apart. Inside `jit` and `vmap` the values are not known, and
+    NaN in gives NaN out. Clouds of another than unit size are not refused; the confidence falls.
     """
     check_params(params)
     for name, count in (("iterations", iterations), ("cascades", cascades)):
         if count is not None and (isinstance(count, bool) or not isinstance(count, Integral)):
             raise ValueError(f"{name}: got {count!r}, wanted a whole number of at least 1")
     clouds = {"source": source, "target": target}
-    finite = _checked(clouds)
+    usable = checked(clouds)
     found = _register(
         params, source, target, iterations=iterations, cascades=cascades, settings=settings
     )
-    _refuse_unless(finite, clouds)
+    refuse_unless(usable, clouds)
     return found
 
 
@@ -164,7 +170,11 @@ def _register(
         source.mask,
         reference.cloud.mask,
     )
-    confidence = of_registration(calibration_of(params), clues)
+    size = jnp.maximum(
+        root_mean_square(source.points, source.mask),
+        root_mean_square(reference.cloud.points, reference.cloud.mask),
+    )
+    confidence = of_registration(calibration_of(params), clues, size)
     return Registration(**of_all, **of_last, clues=clues, confidence=confidence)
 
 
@@ -173,55 +183,3 @@ def _prepared(name: str, cloud: Array | Cloud, settings: Settings) -> Cloud:
         return cloud
     check_points(name, cloud)
     return prepare(cloud, settings=settings)
-
-
-def _checked(clouds: dict[str, Any]) -> Array | None:
-    """Checks what a compiled function cannot check, as far as the values are known by now.
-
-    Clouds on the device stay there. For them the device computes one flag, which this returns:
-    whether all of their values are finite.
-    """
-    on_device = []
-    for name, cloud in clouds.items():
-        if isinstance(cloud, Cloud | Encoded | jax.core.Tracer):
-            continue
-        if not isinstance(cloud, np.ndarray | jax.Array):
-            raise ValueError(
-                f"{name}: got a {type(cloud).__name__}, wanted an array (n, 3) or (n, 6), "
-                "or what `prepare` or `encode` returned"
-            )
-        check_points(name, cloud)
-        if cloud.dtype.kind not in "fiu":
-            raise ValueError(f"{name}: got {cloud.dtype}, wanted floats or integers")
-        if isinstance(cloud, np.ndarray):
-            _check_finite(name, cloud)
-        else:
-            on_device.append(cloud)
-    with jax.ensure_compile_time_eval():  # concrete arrays have values even in a traced caller
-        return _all_finite(on_device) if on_device else None
-
-
-@jax.jit
-def _all_finite(clouds: list[Array]) -> Array:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(cloud)) for cloud in clouds]))
-
-
-def _refuse_unless(finite: Array | None, clouds: dict[str, Any]) -> None:
-    """Raises ValueError if values on the device are not finite.
-
-    Call this after the work was sent to the device: it waits for the flag alone. Rows are fetched
-    only for the message.
-    """
-    if finite is not None and not jax.device_get(finite):
-        for name, cloud in clouds.items():
-            if isinstance(cloud, jax.Array) and not isinstance(cloud, jax.core.Tracer):
-                _check_finite(name, jax.device_get(cloud))
-
-
-def _check_finite(name: str, cloud: np.ndarray) -> None:
-    wrong = np.flatnonzero(~np.isfinite(cloud).all(axis=1))
-    if len(wrong):
-        raise ValueError(
-            f"{name}: row {wrong[0]} is not finite, and {len(wrong) - 1} more; "
-            "wanted finite numbers"
-        )

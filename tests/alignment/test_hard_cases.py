@@ -1,0 +1,37 @@
+"""How often an answer to a hard pair is wrong and trusted, or right and doubted."""
+
+import hard_cases
+import pytest
+
+from cfr_jax.alignment.align import align
+
+
+def counted(kinds, count, seed):
+    counts = hard_cases.Counts()
+    for case in hard_cases.drawn(kinds, count, seed):
+        found = align(case.source, case.target, **case.options)
+        counts.add(case.right(found.transform), found.trusted)
+    return counts
+
+
+# Sizes that share two compiled programs. The seeds are not those that thresholds were chosen with.
+@pytest.mark.parametrize("kind", ["wrong normals", "strays", "duplicates"])
+def test_what_spoils_a_cloud_neither_fools_nor_frightens(kind):
+    counts = counted((kind,), 4, seed=11)
+
+    assert counts.wrong_and_trusted == 0
+    assert counts.right >= 3 and counts.right_and_doubted <= 1
+
+
+def test_noise_and_solids_of_revolution_are_not_trusted():
+    assert counted(("noise",), 4, seed=11).wrong_and_trusted == 0
+    assert counted(("revolution",), 32, seed=11).wrong_and_trusted <= 1
+
+
+@pytest.mark.slow
+def test_of_three_hundred_answers_few_are_wrong_and_trusted_or_right_and_doubted():
+    counts = counted(tuple(hard_cases.KINDS), 28, seed=12)
+
+    assert counts.answers >= 300
+    assert counts.wrong_and_trusted <= 0.05 * counts.answers
+    assert counts.right_and_doubted <= 0.1 * counts.answers
