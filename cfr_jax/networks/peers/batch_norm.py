@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from cfr_jax.networks.layers import EPSILON, kernel_init
+from cfr_jax.networks.record import Params
 
 PAIRS = "pairs"
 MOMENTUM = 0.1
@@ -75,7 +76,7 @@ class NormedLinear(nn.Module):
 
 
 def apply_in_training(
-    module: nn.Module, params: dict, *given: Any, method: Any = None
+    module: nn.Module, params: Params, *given: Any, method: Any = None
 ) -> tuple[Any, Float[Array, ""]]:
     """What a module answers in training, and a term for its loss: zero, with the gradient that lets
     the running statistics follow the batch. Only inside a `vmap` whose axis is `PAIRS`."""

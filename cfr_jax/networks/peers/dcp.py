@@ -27,7 +27,7 @@ from cfr_jax.networks.peers.transformer import (
     check_sizes,
     places_of_transformer,
 )
-from cfr_jax.networks.record import Checkpoint, Goal, Network, Part, Place, Step
+from cfr_jax.networks.record import Checkpoint, Goal, Network, Params, Part, Place, Step
 from cfr_jax.networks.sinkhorn import Affinity, Match
 
 WIDTH = 512
@@ -53,9 +53,9 @@ class DCP(nn.Module):
     training: bool = False
 
     def setup(self) -> None:
-        self.embedding = EdgeFeatures(self.width, self.training)
+        self.embedding: EdgeFeatures = EdgeFeatures(self.width, self.training)
         if self.transformed:
-            self.pointer = Transformer(2 * self.width)
+            self.pointer: Transformer = Transformer(2 * self.width)
 
     def embed(self, cloud: Cloud) -> Float[Array, "n w"]:
         """The features of a cloud by itself."""
@@ -79,7 +79,7 @@ class DCP(nn.Module):
 
 def init_params(
     key: jax.Array, iterations: int | None = None, width: int = 0, version: str = ""
-) -> dict:
+) -> Params:
     """Fresh parameters, a pytree of float32 arrays: of "v2" or "v1", with features so wide ("" and
     0: v2, 512). There is one iteration, whatever `iterations` says."""
     if version not in ("", "v1", "v2"):
@@ -96,7 +96,7 @@ def check_width(width: int) -> None:
         raise ValueError(f"width: got {width}, wanted a multiple of 8")
 
 
-def unroll(params: dict, source: Cloud, target: Cloud, settings: DCPSettings) -> Iterator[Step]:
+def unroll(params: Params, source: Cloud, target: Cloud, settings: DCPSettings) -> Iterator[Step]:
     """The one answer; normals are not used, and neither are gradients stopped."""
     check_sizes("DCP", len(source.points), len(target.points))
     f, g = module_of(params).bind({"params": params})(source, target)
@@ -104,7 +104,7 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: DCPSettings) ->
 
 
 def objective(
-    params: dict,
+    params: Params,
     source: Cloud,
     target: Cloud,
     truth: Float[Array, "4 4"],
@@ -147,7 +147,7 @@ def module_of(params: Mapping[str, Any], training: bool = False) -> DCP:
     return DCP(width, "pointer" in params, training)
 
 
-def parts(params: dict, settings: DCPSettings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
+def parts(params: Params, settings: DCPSettings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
     """All parts of the registration of two clouds, for timing."""
     network = module_of(params).bind({"params": params})
     embed = jax.jit(lambda cloud: network.embed(cloud))

@@ -25,7 +25,7 @@ from cfr_jax.networks.parts import FEATURES, MOTION
 from cfr_jax.networks.peers.batch_norm import NormedLinear, apply_in_training, places_of_layer
 from cfr_jax.networks.peers.gauss_newton import jacobian, steps_of
 from cfr_jax.networks.peers.maximum import highest
-from cfr_jax.networks.record import Checkpoint, Goal, Motion, Network, Part, Place
+from cfr_jax.networks.record import Checkpoint, Goal, Motion, Network, Params, Part, Place
 
 _ENCODER = (64, 64, 64, 128, 1024)
 _DECODER = (1024, 512, 256)
@@ -83,10 +83,10 @@ class FMR(nn.Module):
     training: bool = False
 
     def setup(self) -> None:
-        self.encoder = Encoder(self.training)
+        self.encoder: Encoder = Encoder(self.training)
         if self.decoded:
-            self.decoder = Decoder(self.training)
-        self.step = self.param("step", nn.initializers.constant(_STEP), (6, 1))
+            self.decoder: Decoder = Decoder(self.training)
+        self.step: Array = self.param("step", nn.initializers.constant(_STEP), (6, 1))
 
     def encode(
         self, points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
@@ -102,13 +102,13 @@ class FMR(nn.Module):
         return self.decoder(vector) if self.decoded else vector
 
 
-def init_params(key: jax.Array, iterations: int | None = None, decoded: bool = True) -> dict:
+def init_params(key: jax.Array, iterations: int | None = None, decoded: bool = True) -> Params:
     """Fresh parameters, a pytree of float32 arrays; any number of `iterations` shares them.
     Without `decoded` they lack the decoder, which a registration does not need."""
     return FMR(decoded).init(key, jnp.zeros((2, 3), jnp.float32))["params"]
 
 
-def unroll(params: dict, source: Cloud, target: Cloud, settings: FMRSettings) -> Iterator[Motion]:
+def unroll(params: Params, source: Cloud, target: Cloud, settings: FMRSettings) -> Iterator[Motion]:
     """The iterations, one by one; neither normals nor neighbors are used.
 
     Gradients flow through all of them. Once a step is below 1e-7, none follows.
@@ -128,7 +128,7 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: FMRSettings) ->
 
 
 def objective(
-    params: dict, source: Cloud, target: Cloud, truth: Float[Array, "4 4"], settings: FMRSettings
+    params: Params, source: Cloud, target: Cloud, truth: Float[Array, "4 4"], settings: FMRSettings
 ) -> Goal:
     """The published losses: the Chamfer distances of both clouds to what the decoder makes of them;
     with `supervised` also the squared entries of T T_truth^-1 - I, summed."""
@@ -159,7 +159,7 @@ def _centered(cloud: Cloud) -> tuple[Float[Array, "n 3"], Float[Array, "4 4"]]:
     return points - middle, rigid.from_parts(jnp.eye(3, dtype=points.dtype), -middle)
 
 
-def parts(params: dict, settings: FMRSettings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
+def parts(params: Params, settings: FMRSettings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
     """All parts of the registration of two clouds, for timing: the vectors, and all else."""
     network = FMR("decoder" in params).bind({"params": params})
     encode = jax.jit(lambda points: network.encode(points))

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 
-@jax.custom_vjp
 def highest(x: Float[Array, "*rows k c"]) -> Float[Array, "*rows c"]:
     """The maximum over the axis before the last, channel by channel.
 
@@ -15,6 +14,11 @@ def highest(x: Float[Array, "*rows k c"]) -> Float[Array, "*rows c"]:
     the entries with the maximum and divides by how many are equal: none is, and the gradient NaN,
     where a compiler makes the entries twice and rounds them apart.
     """
+    return _highest(x)
+
+
+@jax.custom_vjp
+def _highest(x: Array) -> Array:
     return jnp.max(x, axis=-2)
 
 
@@ -34,4 +38,4 @@ def _backward(
     return (jnp.where(own, gradient[..., None, :], 0),)
 
 
-highest.defvjp(_forward, _backward)
+_highest.defvjp(_forward, _backward)

@@ -27,7 +27,7 @@ from cfr_jax.networks.peers.dcp import check_width
 from cfr_jax.networks.peers.edges import EdgeFeatures, places_of_edges
 from cfr_jax.networks.peers.graphs import GraphLayer, places_of_graphs
 from cfr_jax.networks.peers.transformer import check_sizes
-from cfr_jax.networks.record import Checkpoint, Goal, Motion, Network, Part, Place
+from cfr_jax.networks.record import Checkpoint, Goal, Motion, Network, Params, Part, Place
 
 WIDTH = 512
 _INLIER = 0.5  # least sum of a row or a column that is assigned
@@ -79,7 +79,7 @@ class RGM(nn.Module):
         return log_plan
 
 
-def init_params(key: jax.Array, iterations: int | None = None, width: int = 0) -> dict:
+def init_params(key: jax.Array, iterations: int | None = None, width: int = 0) -> Params:
     """Fresh parameters, a pytree of float32 arrays, with features so wide (0: 512). There is one
     iteration, whatever `iterations` says."""
     check_width(width)
@@ -88,7 +88,7 @@ def init_params(key: jax.Array, iterations: int | None = None, width: int = 0) -
     return RGM(width or WIDTH, passes=1).init(key, cloud, cloud)["params"]
 
 
-def unroll(params: dict, source: Cloud, target: Cloud, settings: RGMSettings) -> Iterator[Motion]:
+def unroll(params: Params, source: Cloud, target: Cloud, settings: RGMSettings) -> Iterator[Motion]:
     """The one answer: clouds are matched both ways, and pairs kept that both found.
 
     The host assigns (`assignment.assign`), so no gradient passes. Normals are not used. Unlike in
@@ -107,7 +107,7 @@ def unroll(params: dict, source: Cloud, target: Cloud, settings: RGMSettings) ->
 
 
 def objective(
-    params: dict,
+    params: Params,
     source: Cloud,
     target: Cloud,
     truth: Float[Array, "4 4"],
@@ -130,7 +130,7 @@ def objective(
 
 
 def _log_plan(
-    params: dict, source: Cloud, target: Cloud, settings: RGMSettings
+    params: Params, source: Cloud, target: Cloud, settings: RGMSettings
 ) -> Float[Array, "n m"]:
     found: Array = module_of(params, settings).bind({"params": params})(source, target)
     return found
@@ -142,7 +142,7 @@ def module_of(params: Mapping[str, Any], settings: RGMSettings) -> RGM:
     return RGM(width, settings.passes, settings.slack, settings.training)
 
 
-def parts(params: dict, settings: RGMSettings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
+def parts(params: Params, settings: RGMSettings) -> Callable[[Cloud, Cloud], Iterator[Part]]:
     """All parts of the registration of two clouds, for timing; here features are all of the
     network."""
     soft = jax.jit(lambda source, target: _log_plan(params, source, target, settings))
