@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cfr_jax import io
-from cfr_jax.batch.journal import FORMAT, line_of
+from cfr_jax.batch.journal import line_of
 from cfr_jax.cli import main
 from cfr_jax.cli.shared import outputs
 
@@ -27,7 +27,10 @@ MISTAKES = {
     "a file cut off": ("register cut.ply b.ply", "cut.ply: "),
     "words for numbers": ("register words.xyz b.ply", "words.xyz: "),
     "a cloud on its side": ("register side.npy b.ply", "transposed"),
-    "a number that is none": ("register nan.npy b.ply", "wanted finite coordinates"),
+    "only numbers that are none": (
+        "register nan.npy b.ply",
+        "nan.npy: all 5 points are NaN or infinite, wanted at least one that is not",
+    ),
     "beyond any unit": ("register huge.npy b.ply", "wanted finite coordinates within"),
     "two points": ("register two.npy b.ply", "got 2 points, wanted at least 3"),
     "all in one place": ("register same.npy b.ply", "wanted a cloud with some extent"),
@@ -131,7 +134,7 @@ def place(tmp_path, monkeypatch):
     }
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
-    begun = {"format": FORMAT, "made_with": {"weights": "0" * 64}}
+    begun = {"format": "cfr_jax/batch/2", "made_with": {"weights": "0" * 64}}
     (tmp_path / "begun.jsonl").write_bytes(line_of(begun))
     for name in ("empty.ply", "photo.jpg", "photos/1.jpg"):
         (tmp_path / name).touch()
