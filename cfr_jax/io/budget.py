@@ -29,9 +29,10 @@ def check_room(count: int, each: int, size: int, what: str, taken: int = 0) -> N
         )
 
 
-def check_surface(vertices: int, triangles: int, size: int) -> None:
-    """Raises CloudFileError if a mesh is too large for a file of `size` bytes."""
-    if POINT * vertices + TRIANGLE * triangles > room(size):
+def check_surface(vertices: int, triangles: int, size: int, taken: int = 0) -> None:
+    """Raises CloudFileError if a mesh, beside `taken` bytes that are held already, is too large for
+    a file of `size` bytes."""
+    if POINT * vertices + TRIANGLE * triangles + taken > room(size):
         raise CloudFileError(
             f"{vertices} vertices and {triangles} triangles in {size} bytes are more than we read, "
             "wanted a smaller file or one with more bytes to each"

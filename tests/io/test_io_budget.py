@@ -140,11 +140,12 @@ def test_files_that_grow_stay_within_their_budget_at_every_size(name, size):
     assert excesses(costs) == []
 
 
-def test_the_meter_sees_memory_and_time(tmp_path):
-    """Of a file of 24 MB, 24 MB are read and as many are made of them."""
+def test_the_meter_sees_memory_and_time():
+    """Of a file of 24 MB, 24 MB are read and 36 MB are made; the heap has a few to spare."""
     costs = measured(24_000_000, 1, ("scan.bin",))
     for cost in costs.values():
-        assert cost["error"] == "" and 24e6 + 36e6 < cost["bytes"] < 4 * 24e6 + BYTES
+        assert cost["error"] == ""
+        assert 0.8 * 60e6 < cost["bytes"] < 4 * 24e6 + BYTES
         assert 0.005 < cost["seconds"]
 
 

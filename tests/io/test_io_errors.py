@@ -11,6 +11,7 @@ import warnings
 
 import numpy as np
 import pytest
+from amplifying_meshes import document
 from io_samples import moved_gltf, pcd, points, write_clouds, write_meshes
 
 from cfr_jax.io import CloudFileError, CloudWarning, PointCloud, read, write
@@ -219,3 +220,20 @@ def test_an_array_on_its_side_is_no_cloud_of_three_points(tmp_path):
     np.save(path, np.random.default_rng(0).normal(size=(3, 400)))
 
     assert "transposed" in refusal(path)
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "a folder", "a pipe", "much of nothing", "\ud800"])
+def test_names_that_cannot_be_opened_are_refused_alone_and_as_a_buffer(name, tmp_path):
+    # given
+    (tmp_path / "a folder.ply").mkdir()
+    os.mkfifo(tmp_path / "a pipe.ply")
+    with open(tmp_path / "much of nothing.ply", "wb") as stream:
+        stream.truncate(200 << 30)  # bytes, none of them on the disk
+    parts = document(buffers=[{"byteLength": 36, "uri": f"{name}.ply"}])
+    (tmp_path / "a.gltf").write_text(json.dumps(parts))
+
+    # then
+    with pytest.raises(CloudFileError) as caught:
+        read(tmp_path / f"{name}.ply")
+    assert len(str(caught.value)) <= 600
+    assert "buffer 0" in refusal(tmp_path / "a.gltf")

@@ -27,6 +27,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 INSTALLED_AS = {
     "absl": "absl-py",
     "orbax": "orbax-checkpoint",
+    "lzf": "python-neo-lzf",
     "small_gicp": "small-gicp",
     "kiss_matcher": "kiss-matcher",
     "rerun": "rerun-sdk",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import struct
 from pathlib import Path
 from typing import Any
@@ -218,7 +219,7 @@ class _Scene:
 
     def _beside(self, index: int, uri: str) -> bytes:
         """A buffer in a file of its own; a document may not name files of other folders."""
-        if "\0" in uri or Path(uri).name != uri or not (self.folder / uri).is_file():
+        if "\0" in uri or Path(uri).name != uri or not os.path.isfile(self.folder / uri):
             raise CloudFileError(f"buffer {index}: wanted a file {uri[:80]!r} in the same folder")
         try:
             return contents(self.folder / uri)

@@ -25,7 +25,7 @@ from cfr_jax.io.table import cloud_of_filled
 
 _OFF_MARK = re.compile(rb"(?:[^\S\n]*(?:#[^\n]*)?\n)*\s*(?:ST)?(?:C)?(?:N)?OFF")
 
-_LONGEST = 1 << 22  # bytes of a line that goes on behind backslashes
+_LONGEST = 1 << 20  # bytes of a line that goes on behind backslashes
 _NO_FACES = "has no faces: took its vertices for a cloud"
 _INDENT = re.compile(rb"^[ \t]+", re.MULTILINE)
 _TEXTURE_AND_NORMAL = re.compile(rb"/\S*")
@@ -123,7 +123,7 @@ def _obj_blocks(data: bytes) -> Iterator[tuple[int, bytes]]:
     begin, line = behind_mark(data), 1
     while begin < len(data):
         end = block_end(data, begin, len(data), line)
-        while data[end - 2 : end] == b"\\\n" or data[end - 3 : end] == b"\\\r\n":
+        while end < len(data) and data[end - 3 : end].endswith((b"\\\n", b"\\\r\n")):
             end = block_end(data, end, len(data), line)
             if end - begin > _LONGEST:
                 raise CloudFileError(f"behind line {line}: one line goes on for too long")

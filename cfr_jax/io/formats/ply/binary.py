@@ -97,7 +97,7 @@ def _unequal_rows(
     data: bytes, offset: int, order: str, element: Element, wanted: list[bool]
 ) -> tuple[Held, int]:
     """The properties of rows that differ in size, and the offset behind them."""
-    check_room(element.count, 24, len(data), "rows of different sizes")
+    check_room(element.count, 32, len(data), "rows of different sizes")
     octets = np.frombuffer(data, np.uint8)
     parts: list[list] = [[] for _ in element.properties]
     sizes: list[list] = [[] for _ in element.properties]

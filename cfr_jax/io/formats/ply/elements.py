@@ -183,6 +183,8 @@ def _typed(columns: Held, element: Element) -> Held:
 
 
 def _cast(values: np.ndarray, kind: str) -> np.ndarray:
+    if values.dtype == np.dtype(kind):
+        return values
     with np.errstate(all="ignore"):
         cast = values.astype(kind)
         if np.dtype(kind).kind == "f":

@@ -53,7 +53,10 @@ def parse(
     check_room(elements[vertex].count, each, len(data), "vertices")
     polygons = _polygons(elements, held)
     if polygons is not None:
-        check_surface(elements[vertex].count, triangles_within(polygons[1]), len(data))
+        # Unless they are views of the file, the polygons are held beside the triangles.
+        taken = sum(part.nbytes for part in polygons if part.base is None)
+        count = triangles_within(polygons[1])
+        check_surface(elements[vertex].count, count, len(data), taken)
     try:
         table = table_of(
             names,

@@ -10,12 +10,11 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float64
 
-from cfr_jax.io.budget import check_room
+from cfr_jax.io.budget import POINT, check_room
 from cfr_jax.io.cloud import CloudFileError
 from cfr_jax.io.formats.text.dialect import Layout
-from cfr_jax.io.formats.text.lines import bad_line, without_comments
+from cfr_jax.io.formats.text.lines import bad_line, block_end, without_comments
 
-_BLOCK = 1 << 20
 _CANNOT = re.compile(r"could not convert string .* at row \d+, column (\d+)")
 
 
@@ -24,6 +23,8 @@ def read_numbers(
 ) -> Float64[np.ndarray, "n c"]:
     """The chosen columns of all rows as float64; all columns if None, which no row may lack."""
     width = layout.width if columns is None else len(columns)
+    # Points that are no whole row are copied, and normals are scaled as well.
+    each = 8 * width + {3: 0, 6: 3 * POINT}.get(width, POINT)
     most = data.count(b"\n", layout.body) + 1
     table = np.empty((most, width))
     done = 0
@@ -31,7 +32,7 @@ def read_numbers(
         rows = _load(block, line, layout, columns, np.dtype(np.float64))
         if len(rows) and rows.shape[1] != width:
             raise _uneven(line)
-        check_room(done + len(rows), 8 * width, len(data), "rows of numbers and more")
+        check_room(done + len(rows), each, len(data), "rows of numbers and more")
         table[done : done + len(rows)] = rows
         done += len(rows)
     return table[:done]
@@ -101,7 +102,7 @@ class _Unfit(ValueError):
 
 
 def blocks(data: bytes, layout: Layout) -> Iterator[tuple[int, bytes]]:
-    """Whole lines of the body, a megabyte at a time, cleaned of comments and carriage returns.
+    """Whole lines of the body, half a megabyte at a time, cleaned of comments and carriage returns.
 
     With each comes the number of its first line. A file that says how many points it has ends
     there.
@@ -109,8 +110,7 @@ def blocks(data: bytes, layout: Layout) -> Iterator[tuple[int, bytes]]:
     start, line = layout.body, layout.line
     left = layout.count
     while start < len(data) and left != 0:
-        end = data.find(b"\n", start + _BLOCK)
-        end = len(data) if end < 0 else end + 1
+        end = block_end(data, start, len(data), line)
         block = data[start:end]
         newlines = block.count(b"\n")
         if b"\r" in block:

@@ -15,7 +15,7 @@ from cfr_jax.io.cloud import CloudFileError
 _BLANKS_TO_NEWLINES = bytes.maketrans(b" \t\v\f\r", b"\n\n\n\n\n")
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _BLOCK = 1 << 19
-_LONGEST_LINE = 1 << 21
+_LONGEST_LINE = 1 << 19
 
 
 def clean_text(data: bytes) -> bytes:
