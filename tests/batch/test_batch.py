@@ -149,14 +149,14 @@ def sized(*counts):
 
 
 def test_clouds_of_one_padded_size_share_a_batch(quick):
-    list(align_many(sized(90, 150, 100, 151, 110), params={}, batch=2))
+    list(align_many(sized(90, 150, 100, 151, 110), batch=2))
     assert Quick.last.calls == [[90, 100], [150, 151], [110]]
 
 
 def test_outcomes_come_in_order_or_as_they_are_done(quick):
     pairs = sized(90, 150, 100)
-    as_done = [o.index for o in align_many(pairs, params={}, batch=2, ordered=False)]
-    in_order = [o.index for o in align_many(pairs, params={}, batch=2)]
+    as_done = [o.index for o in align_many(pairs, batch=2, ordered=False)]
+    in_order = [o.index for o in align_many(pairs, batch=2)]
     assert as_done == [0, 2, 1] and in_order == [0, 1, 2]
 
 
@@ -165,7 +165,7 @@ def test_a_rare_size_does_not_wait_for_ever(quick):
     pairs = sized(300, *range(2, 63))
 
     # when: every small size is a program of its own
-    order = [o.index for o in align_many(pairs[:40], params={}, batch=3, ordered=False)]
+    order = [o.index for o in align_many(pairs[:40], batch=3, ordered=False)]
 
     # then
     assert sorted(order) == list(range(40)) and order.index(0) < 30
@@ -179,7 +179,7 @@ def test_pairs_are_drawn_only_as_they_are_needed(quick):
             drawn.append(pair)
             yield pair
 
-    outcomes = align_many(endless(), params={}, batch=1, workers=2)
+    outcomes = align_many(endless(), batch=1, workers=2)
     next(outcomes)
     outcomes.close()
     assert len(drawn) < 10
@@ -202,7 +202,7 @@ def test_wrong_options_are_refused_before_any_pair_is_drawn(options, said, unche
 
 
 def test_no_pairs_are_no_outcomes(quick):
-    assert list(cfr_jax.align_many([], params={})) == []
+    assert list(cfr_jax.align_many([])) == []
 
 
 def test_whoever_asks_for_a_value_that_is_being_made_waits_for_it():
@@ -240,5 +240,5 @@ def test_a_value_that_could_not_be_made_is_tried_again():
 
 def test_on_a_cpu_pairs_are_solved_one_at_a_time(quick):
     assert jax.default_backend() == "cpu"
-    list(align_many(sized(90, 91), params={}))
+    list(align_many(sized(90, 91)))
     assert Quick.last.size == stream.ON_CPU

@@ -93,10 +93,16 @@ def test_coefficients_of_other_clues_are_refused():
         FITTED.check("align", ["speed"])
 
 
+def samples_of_the_unit_sphere(rng):
+    # `register` expects unit size, and trusts clouds of another less
+    points = rng.normal(size=(12, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
 def test_register_gives_a_confidence_where_the_weights_have_one_and_none_elsewhere(params):
     # given the same weights twice, and a calibration that is sure of everything
     rng = np.random.default_rng(0)
-    clouds = [jnp.float32(rng.normal(size=(12, 3))) for _ in range(2)]
+    clouds = [jnp.float32(samples_of_the_unit_sphere(rng)) for _ in range(2)]
     sure = {name: 0.0 for name, _ in calibration_of(load_params()).register} | {"bias": 3.0}
     calibrated = params | {KEY: Calibration.of(sure, {"bias": 0.0})}
 

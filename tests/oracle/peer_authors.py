@@ -78,7 +78,9 @@ class _Draw:
         self.put(f"{name}.bias", self.rng.uniform(-0.1, 0.1, channels))
         self.put(f"{name}.running_mean", self.rng.uniform(-0.1, 0.1, channels))
         self.put(f"{name}.running_var", self.rng.uniform(0.05, 0.2, channels))
-        self.state[f"{name}.num_batches_tracked"] = np.int64(1000)
+        self.state[f"{name}.num_batches_tracked"] = np.array(
+            1000
+        )  # torch has an array without axes, too
 
     def edges(self, prefix: str, width: int) -> None:
         widths = (6, width // 8, width // 8, width // 4, width // 2)

@@ -197,6 +197,9 @@ def names_what_there_is(command: list[str]) -> bool:
             return (ROOT / module.replace(".", "/")).with_suffix(".py").is_file()
         case ["python" | "python3", file, *_]:
             return (ROOT / file).is_file()
+        case ["apt-get", "download", package]:  # of those that the corpus is made from
+            makers = (ROOT / "cfr_jax/data/making").rglob("*.py")
+            return any(package in maker.read_text("utf-8") for maker in makers)
         case ["jupyter", "lab", file]:
             return (ROOT / file).is_file()
         case _:

@@ -163,7 +163,7 @@ class JournalFile(Door):
         from cfr_jax.batch import journal
 
         self.module = journal
-        header = {"format": journal.FORMAT, "made_with": self.made_with}
+        header = {"format": "cfr_jax/batch/2", "made_with": self.made_with}
         record = {"source": "a", "target": "b", "repeat": 0, "error": None, "transform": _MOTION}
         self.values = [header, record, record | {"source": "c"}, record | {"error": "is empty"}]
         self.lines = [journal.line_of(value) for value in self.values]

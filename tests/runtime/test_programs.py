@@ -148,7 +148,9 @@ def test_all_programs_of_the_command_line_can_be_kept(folder):
     list(align_many([(source, target)]))
 
     kept = {path.name.split("-")[0] for path in folder.rglob("*.stablehlo")}
-    assert kept == {"propose", "polish", "solve_pair", "encode_target", "solve_many"}
+    assert kept == {
+        "propose", "polish", "solve_pair", "refined_start", "encode_target", "solve_many"
+    }  # fmt: skip
 
 
 def test_a_folder_that_cannot_be_written_costs_only_time(tmp_path, monkeypatch):
