@@ -7,11 +7,12 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
 from cfr_jax.data.layout import Layout
+from cfr_jax.runtime.sequences import MadeOnAccess
 
 _ROLE = re.compile(r"(^|[._/-])(source|src|target|tgt|dst)(?=$|[._/-])")
 _TARGETS = ("target", "tgt", "dst")
@@ -34,7 +35,7 @@ class Job:
         return self.source, self.target, self.repeat
 
 
-class Jobs(Sequence[Job]):
+class Jobs(MadeOnAccess[Job]):
     """The pairs of a list, of which only how often each was listed before is in memory."""
 
     def __init__(self, names: Sequence[Sequence[str]], pairs: Sequence[Any]):
@@ -44,15 +45,7 @@ class Jobs(Sequence[Job]):
     def __len__(self) -> int:
         return len(self._pairs)
 
-    @overload
-    def __getitem__(self, index: int) -> Job: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Job]: ...
-
-    def __getitem__(self, index: int | slice) -> Job | list[Job]:
-        if isinstance(index, slice):
-            return [self[row] for row in range(len(self))[index]]
+    def _make(self, index: int) -> Job:
         return Job(*self.key(index), self._pairs[index])
 
     def key(self, row: int) -> tuple[str, str, int]:

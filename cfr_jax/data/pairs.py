@@ -19,7 +19,7 @@ from array import array
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -27,7 +27,7 @@ from jaxtyping import Float
 from cfr_jax.data.hdf5 import reading as hdf5
 from cfr_jax.geometry.motions import are_rigid, check_rigid
 from cfr_jax.runtime.reading import opened
-from cfr_jax.runtime.sequences import OnDemand, Texts
+from cfr_jax.runtime.sequences import MadeOnAccess, OnDemand, Texts
 from cfr_jax.runtime.words import Refused, shown
 
 _OF_A_PAIR = ("source", "target", "source_normals", "target_normals", "transform", "overlap")
@@ -64,11 +64,7 @@ def among(chosen: tuple[int, int] | None, frames: Iterable[int | str]) -> bool:
     )
 
 
-class PairsOnDemand(OnDemand[Pair]):
-    """`count` pairs, where pair i is `make(i)`, made each time it is accessed."""
-
-
-class PairFile(Sequence[Pair]):
+class PairFile(MadeOnAccess[Pair]):
     """The pairs of a file, in its order."""
 
     path: Path
@@ -81,22 +77,6 @@ class PairFile(Sequence[Pair]):
     @property
     def names(self) -> tuple[str, ...]:
         """What each pair is called; reads no cloud."""
-        raise NotImplementedError
-
-    @overload
-    def __getitem__(self, index: int) -> Pair: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Pair]: ...
-
-    def __getitem__(self, index: int | slice) -> Pair | list[Pair]:
-        if isinstance(index, slice):
-            return [self[row] for row in range(len(self))[index]]
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"index: got {index}, wanted one of {len(self)} pairs")
-        return self._read(range(len(self))[index])
-
-    def _read(self, index: int) -> Pair:
         raise NotImplementedError
 
 
@@ -150,7 +130,7 @@ class CsvPairs(PairFile):
         """Source and target of each pair, as written in the list."""
         return OnDemand(len(self), lambda row: (self._sources[row], self._targets[row]))
 
-    def _read(self, index: int) -> Pair:
+    def _make(self, index: int) -> Pair:
         from cfr_jax.io import read  # imported here: a list alone does not need the readers
 
         source_file, target_file = self.listed[index]
@@ -229,7 +209,7 @@ class Hdf5Pairs(PairFile):
             return int(said["@source_frame"]), int(said["@target_frame"])
         return f"{name}/source", f"{name}/target"
 
-    def _read(self, index: int) -> Pair:
+    def _make(self, index: int) -> Pair:
         name = self.names[index]
         where = f"{shown(self.path)}, {shown(name)}"
         found = hdf5.read(self.path, group=name, arrays=_OF_A_PAIR)

@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from cfr_jax.data.corpus import Corpus
-from cfr_jax.data.pairs import Pair, PairsOnDemand
+from cfr_jax.data.pairs import Pair
 from cfr_jax.geometry import motions
+from cfr_jax.runtime.sequences import OnDemand
 
 Rng = np.random.RandomState | np.random.Generator
 
@@ -74,7 +75,7 @@ PROTOCOLS = {
 }
 
 
-def fixed_pairs(corpus: Corpus, protocol: str) -> PairsOnDemand:
+def fixed_pairs(corpus: Corpus, protocol: str) -> OnDemand[Pair]:
     """The published test set for `corpus` by the protocol of this name.
 
     Raises ValueError for an unknown protocol.
@@ -82,7 +83,7 @@ def fixed_pairs(corpus: Corpus, protocol: str) -> PairsOnDemand:
     if protocol not in PROTOCOLS:
         raise ValueError(f"protocol: got {protocol!r}, wanted one of {', '.join(PROTOCOLS)}")
     chosen = PROTOCOLS[protocol]
-    return PairsOnDemand(len(corpus), lambda index: fixed_pair(corpus, index, chosen))
+    return OnDemand(len(corpus), lambda index: fixed_pair(corpus, index, chosen))
 
 
 def fixed_pair(corpus: Corpus, index: int, protocol: Protocol) -> Pair:

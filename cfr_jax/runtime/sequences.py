@@ -9,14 +9,8 @@ from typing import Any, Generic, TypeVar, overload
 Item = TypeVar("Item")
 
 
-class OnDemand(Sequence[Item], Generic[Item]):
-    """`count` items, where item i is `make(i)`, made each time it is accessed."""
-
-    def __init__(self, count: int, make: Callable[[int], Item]):
-        self._rows, self._make = range(count), make
-
-    def __len__(self) -> int:
-        return len(self._rows)
+class MadeOnAccess(Sequence[Item], Generic[Item]):
+    """A sequence that says how long it is and how item i is made, and keeps no item."""
 
     @overload
     def __getitem__(self, index: int) -> Item: ...
@@ -29,7 +23,23 @@ class OnDemand(Sequence[Item], Generic[Item]):
             return [self[row] for row in range(len(self))[index]]
         if not -len(self) <= index < len(self):
             raise IndexError(f"index: got {index}, wanted one of {len(self)} pairs")
-        return self._make(self._rows[index])
+        return self._make(range(len(self))[index])
+
+    def _make(self, index: int) -> Item:
+        raise NotImplementedError
+
+
+class OnDemand(MadeOnAccess[Item]):
+    """`count` items, where item i is `make(i)`, made each time it is accessed."""
+
+    def __init__(self, count: int, make: Callable[[int], Item]):
+        self._count, self._maker = count, make
+
+    def __len__(self) -> int:
+        return self._count
+
+    def _make(self, index: int) -> Item:
+        return self._maker(index)
 
 
 class Texts:

@@ -53,7 +53,7 @@ class DataKind:
     `data.scenes.scene_source`."""
     evaluate: Callable[..., Sequence[Pair]] | None = None
     """`evaluate(path, cache, *, settings)`: the pairs to evaluate, each with its true transform, as
-    a list or as `data.pairs.PairsOnDemand`."""
+    a list or as `runtime.sequences.OnDemand`."""
     example: str = ""
     """The file in configs/ that evaluates such data, with all settings."""
     list_pairs: Callable[[Path], Listing] | None = None

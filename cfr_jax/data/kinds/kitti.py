@@ -83,7 +83,8 @@ def evaluate(
     as published.
     """
     from cfr_jax.data import kitti
-    from cfr_jax.data.pairs import PairsOnDemand, among
+    from cfr_jax.data.pairs import among
+    from cfr_jax.runtime.sequences import OnDemand
 
     parts = [
         kitti.read_pairs(
@@ -106,7 +107,7 @@ def evaluate(
         part, row = places[index]
         return kitti.scan_pair(part, row, points, angle, translation)
 
-    return PairsOnDemand(len(places), make)
+    return OnDemand(len(places), make)
 
 
 def list_scans(path: Path) -> list[Path]:

@@ -53,13 +53,14 @@ def evaluate(
 ) -> Sequence[Pair]:
     """The pairs in the range `frames`, as in training. Pairs without frame numbers are in no range;
     without `frames`, all pairs are used."""
-    from cfr_jax.data.pairs import Hdf5Pairs, PairsOnDemand, among
+    from cfr_jax.data.pairs import Hdf5Pairs, among
+    from cfr_jax.runtime.sequences import OnDemand
 
     held = Hdf5Pairs(path)
     if not frames:
         return held
     rows = [row for row in range(len(held)) if among(frames, held.frames(row))]
-    return PairsOnDemand(len(rows), lambda index: held[rows[index]])
+    return OnDemand(len(rows), lambda index: held[rows[index]])
 
 
 def list_pairs(path: Path) -> Listing:
