@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import colorsys
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 
 import numpy as np
 from jaxtyping import Float
@@ -15,12 +13,7 @@ from jaxtyping import Float
 from cfr_jax.geometry import motions
 from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.viewer.camera import best_view
-from cfr_jax.viewer.page import (
-    content_security_policy,
-    json_for_html,
-    quantized,
-    text_for_html,
-)
+from cfr_jax.viewer.page import filled, quantized
 from cfr_jax.viewer.scene import Scene
 
 _GOLDEN = 0.618034  # of a turn of the color wheel from one layer to the next: no two are alike
@@ -71,16 +64,8 @@ def write_layers(
                 "color": color(number),
             }
         )
-    template = resources.files("cfr_jax.viewer").joinpath("layers.html").read_text("utf-8")
-    fills = {
-        "csp": content_security_policy(template),
-        "title": text_for_html(title),
-        "layers": json_for_html(
-            {"layers": shown, "view": motions.to_quaternion(camera.rotation).tolist()}
-        ),
-    }
-    # In one pass, so that a name that looks like a placeholder is not replaced.
-    page = re.sub(r"\{\{(csp|title|layers)\}\}", lambda match: fills[match[1]], template)
+    view = motions.to_quaternion(camera.rotation).tolist()
+    page = filled("layers.html", title, "layers", {"layers": shown, "view": view})
     write_atomically(path, page.encode())
 
 

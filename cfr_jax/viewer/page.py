@@ -34,18 +34,25 @@ def write_page(path: str | os.PathLike[str], scene: Scene, *, max_points: int = 
     """
     if isinstance(max_points, bool) or not isinstance(max_points, int) or max_points < 1:
         raise ValueError(f"max_points: got {max_points!r}, wanted an integer >= 1")
-    template = resources.files("cfr_jax.viewer").joinpath("page.html").read_text("utf-8")
+    title = f"{scene.source_name} → {scene.target_name}"
+    shown = _payload(scene, best_view(scene), max_points)
+    write_atomically(path, filled("page.html", title, "scene", shown).encode())
+
+
+def filled(name: str, title: str, place: str, shown: dict[str, Any]) -> str:
+    """The page that template `name` becomes with its title, its policy, and what it shows as JSON
+    in the place of that name."""
+    template = resources.files("cfr_jax.viewer").joinpath(name).read_text("utf-8")
     fills = {
-        "csp": content_security_policy(template),
-        "title": text_for_html(f"{scene.source_name} → {scene.target_name}"),
-        "scene": json_for_html(_payload(scene, best_view(scene), max_points)),
+        "csp": _content_security_policy(template),
+        "title": _text_for_html(title),
+        place: _json_for_html(shown),
     }
     # In one pass, so that a name that looks like a placeholder is not replaced.
-    page = re.sub(r"\{\{(csp|title|scene)\}\}", lambda match: fills[match[1]], template)
-    write_atomically(path, page.encode())
+    return re.sub(rf"\{{\{{({'|'.join(fills)})\}}\}}", lambda match: fills[match[1]], template)
 
 
-def content_security_policy(template: str) -> str:
+def _content_security_policy(template: str) -> str:
     """A policy that allows only the template's own script and style, by their hashes."""
     allowed = {
         tag: " ".join(
@@ -60,12 +67,12 @@ def content_security_policy(template: str) -> str:
     )
 
 
-def text_for_html(text: str) -> str:
+def _text_for_html(text: str) -> str:
     """Escapes to plain ASCII, because a file name may hold bytes that no encoding can write."""
     return html.escape(text).encode("ascii", "xmlcharrefreplace").decode("ascii")
 
 
-def json_for_html(value: dict[str, Any]) -> str:
+def _json_for_html(value: dict[str, Any]) -> str:
     """JSON that cannot close the script element around it or open another one."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     for character in "<>&":
