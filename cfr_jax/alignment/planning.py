@@ -14,7 +14,7 @@ from jaxtyping import Float
 from cfr_jax.alignment import starts
 from cfr_jax.geometry import motions, plausible, units
 from cfr_jax.io import PointCloud, as_point_cloud
-from cfr_jax.networks.inputs import Settings
+from cfr_jax.networks.inputs import Settings, refuse_masked
 
 DEFAULT_BUDGET = 1024
 SETTINGS = Settings()
@@ -72,7 +72,7 @@ class Plan:
 def read_clouds(source: Any, target: Any) -> tuple[PointCloud, PointCloud]:
     """Both as clouds; raises ValueError, by name, for what is none or has too few points."""
     for cloud, name in ((source, "source"), (target, "target")):
-        refuse_masked(name, cloud)
+        refuse_masked(name, cloud, "leave their rows out")
     clouds = as_point_cloud(source, name="source"), as_point_cloud(target, name="target")
     for cloud, name in zip(clouds, ("source", "target"), strict=True):
         if len(cloud.points) < 3:
@@ -140,16 +140,6 @@ def planned(
         whole=(_each_place_once(source), _each_place_once(target)) if whole else None,
         remarks=remarks,
     )
-
-
-def refuse_masked(name: str, cloud: Any) -> None:
-    """Raises ValueError for an array of numpy with masked values: what lies under the mask is no
-    point, and the array alone does not tell whether its row may be left out."""
-    if isinstance(cloud, np.ma.MaskedArray) and np.ma.is_masked(cloud):
-        raise ValueError(
-            f"{name}: got an array with {np.ma.count_masked(cloud)} masked values, wanted an array "
-            "without (leave their rows out)"
-        )
 
 
 def _without_wrong_normals(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -106,3 +107,16 @@ def check_points(name: str, points: Array | np.ndarray) -> None:
         )
     if points.shape[0] < 3:
         raise ValueError(f"{name}: got {points.shape[0]} points, wanted at least 3")
+
+
+def refuse_masked(name: str, cloud: Any, instead: str) -> None:
+    """Raises ValueError for an array of numpy with masked values.
+
+    What lies under the mask is no point, and the array alone does not tell whether its row may be
+    left out. `instead` says what its owner can do.
+    """
+    if isinstance(cloud, np.ma.MaskedArray) and np.ma.is_masked(cloud):
+        raise ValueError(
+            f"{name}: got an array with {np.ma.count_masked(cloud)} masked values, wanted an array "
+            f"without ({instead})"
+        )

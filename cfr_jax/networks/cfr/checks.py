@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from cfr_jax.networks.cfr.iterations import Encoded
-from cfr_jax.networks.inputs import Cloud, check_points
+from cfr_jax.networks.inputs import Cloud, check_points, refuse_masked
 
 _FARTHEST = 1e6  # coordinates; sums of fourth powers of larger ones leave float32
 _EXTENTS = 1e4  # as far from the origin as this many extents: float32 then keeps three digits
@@ -70,11 +70,7 @@ def refuse_unless(usable: Array | None, clouds: dict[str, Any]) -> None:
 
 
 def _check_values(name: str, cloud: np.ndarray) -> None:
-    if isinstance(cloud, np.ma.MaskedArray) and np.ma.is_masked(cloud):
-        raise ValueError(
-            f"{name}: got an array with {np.ma.count_masked(cloud)} masked values, wanted an array "
-            "without; `prepare` takes a mask of points"
-        )
+    refuse_masked(name, cloud, "`prepare` takes a mask of points")
     values = np.asarray(cloud, np.float64)
     wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(wrong):
