@@ -21,16 +21,9 @@ def get_config(chosen: str = "v2") -> TrainingConfig:
         version=version,
         iterations=1,
         phases=(Phase(steps=8000, points=1024 if copied else 717, neighbors=19, batch=32),),
-        sampling=SamplingSection(
-            # as the protocols have it: no augmentation beside motion, crop and noise
+        sampling=SamplingSection.plain(
             keep=(1.0, 1.0) if copied else (0.7, 0.7),
             noise=(0.0, 0.0) if copied else (0.01, 0.01),
-            both_ways=0.0,
-            near=0.0,
-            centered=0.0,
-            any_orientation=0.0,
-            scale=(1.0, 1.0),
-            estimated_normals=0.0,
             copied=copied,
         ),
         train=TrainSection(

@@ -21,16 +21,9 @@ def get_config(chosen: str = "unsupervised") -> TrainingConfig:
         iterations=10,
         settings={"supervised": {"unsupervised": False, "supervised": True}[kind]},
         phases=(Phase(steps=16000, points=1024 if copied else 717, neighbors=1, batch=8),),
-        sampling=SamplingSection(
-            # as the protocols have it: no augmentation beside motion, crop and noise
+        sampling=SamplingSection.plain(
             keep=(1.0, 1.0) if copied else (0.7, 0.7),
             noise=(0.0, 0.0) if copied else (0.01, 0.01),
-            both_ways=0.0,
-            near=0.0,
-            centered=0.0,
-            any_orientation=0.0,
-            scale=(1.0, 1.0),
-            estimated_normals=0.0,
             copied=copied,
         ),
         train=TrainSection(

@@ -21,15 +21,8 @@ def get_config(chosen: str = "512") -> TrainingConfig:
         width=int(width),
         iterations=1,
         phases=(Phase(steps=16000, points=717, neighbors=19, batch=4),),
-        sampling=SamplingSection(
-            # as the protocol has it: no augmentation beside motion, crop and noise
+        sampling=SamplingSection.plain(
             keep=(0.7, 0.7),
-            both_ways=0.0,
-            near=0.0,
-            centered=0.0,
-            any_orientation=0.0,
-            scale=(1.0, 1.0),
-            estimated_normals=0.0,
             copied={"": False, "copied": True}[pairs],
         ),
         train=TrainSection(

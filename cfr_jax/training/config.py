@@ -67,6 +67,19 @@ class SamplingSection:
     def __post_init__(self) -> None:
         check_types(self, "sampling.")
 
+    @classmethod
+    def plain(cls, **given: Any) -> "SamplingSection":
+        """What protocols have: no augmentation beside motion, crop and noise."""
+        return cls(
+            both_ways=0.0,
+            near=0.0,
+            centered=0.0,
+            any_orientation=0.0,
+            scale=(1.0, 1.0),
+            estimated_normals=0.0,
+            **given,
+        )
+
 
 @dataclass(slots=True)
 class Phase:
