@@ -21,6 +21,7 @@ from pathlib import Path
 
 import pytest
 from amplifiers import makers
+from peak_memory import memory, reset_peak
 
 SECONDS, BYTES, BYTES_PER_BYTE = 1.0, 64 << 20, 4
 _ADDRESS_SPACE, _LONGEST = 12 << 30, 60  # end what runs away before it takes the machine
@@ -53,8 +54,7 @@ def _read(path: Path, whole: bool) -> dict:
 
     resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_SPACE, _ADDRESS_SPACE))
     resource.setrlimit(resource.RLIMIT_CPU, (_LONGEST, _LONGEST))
-    Path("/proc/self/clear_refs").write_text("5")  # forgets the largest memory so far
-    before, start = _memory("VmRSS"), time.process_time()
+    before, start = reset_peak(), time.process_time()
     error = ""
     try:
         read(path, properties=whole)
@@ -63,12 +63,7 @@ def _read(path: Path, whole: bool) -> dict:
     except BaseException as other:
         return {"raised": f"{type(other).__name__}: {other}"}
     seconds = time.process_time() - start
-    return {"seconds": seconds, "bytes": _memory("VmHWM") - before, "error": error}
-
-
-def _memory(key: str) -> int:
-    status = Path("/proc/self/status").read_text()
-    return 1024 * int(status.split(f"{key}:")[1].split()[0])
+    return {"seconds": seconds, "bytes": memory("VmHWM") - before, "error": error}
 
 
 def run_cases(size: int, seeds: int, names: list[str]) -> dict[str, dict]:

@@ -21,6 +21,7 @@ import numpy as np
 from io_samples import write_clouds, write_meshes
 from kind_samples import all_kinds, solids
 from mutants import mutate
+from peak_memory import memory, reset_peak
 
 CASES = 4000
 SECONDS = 1.0
@@ -54,7 +55,7 @@ def run_cases(cases: int, seed: int) -> dict:
             data = mutate(originals[name], random.Random(f"{seed} {case}"))
             path = place / f"case{Path(name).suffix}"
             path.write_bytes(data)
-            before = _reset_peak()
+            before = reset_peak()
             start = time.perf_counter()
             try:
                 cloud = read(path, properties=case % 2 == 1)
@@ -67,15 +68,15 @@ def run_cases(cases: int, seed: int) -> dict:
             except BaseException as error:
                 failures.append(f"case {case} of {name}: {type(error).__name__}: {error}")
             seconds = time.perf_counter() - start
-            grown = _memory("VmHWM") - before
+            grown = memory("VmHWM") - before
             if seconds > SECONDS:
                 failures.append(f"case {case} of {name}: took {seconds:.1f} s")
             if grown > BYTES + BYTES_PER_BYTE * len(data):
                 failures.append(f"case {case} of {name}: took {grown >> 20} MiB")
             slowest, largest = max(slowest, seconds), max(largest, grown)
-    before = _reset_peak()
+    before = reset_peak()
     bytearray(101 << 20)
-    meter = _memory("VmHWM") - before
+    meter = memory("VmHWM") - before
     return {
         "meter": meter,
         "failures": failures, "refused": refused, "messages": len(messages), "slowest": slowest,
@@ -83,18 +84,7 @@ def run_cases(cases: int, seed: int) -> dict:
     }  # fmt: skip
 
 
-def _reset_peak() -> int:
-    """Forgets the largest memory so far (Linux), and tells the present one in bytes."""
-    Path("/proc/self/clear_refs").write_text("5")
-    return _memory("VmRSS")
-
-
-def _memory(key: str) -> int:
-    status = Path("/proc/self/status").read_text()
-    return 1024 * int(status.split(f"{key}:")[1].split()[0])
-
-
-def test_damaged_files_are_read_or_refused_within_a_second_and_little_memory():
+def test_damaged_files_are_read_or_refused_within_a_second_and_littlememory():
     # given
     command = [sys.executable, __file__, str(CASES), "0"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

@@ -22,11 +22,10 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import mutants
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import mutants  # noqa: E402
+from peak_memory import memory, reset_peak
 
 PACKAGE = Path(__file__).parents[2] / "cfr_jax"
 SHORT = 100  # of each kind; a tenth of it where making one takes long
@@ -503,7 +502,7 @@ def run_cases(kind: str, cases: int, seed: int) -> dict[str, Any]:
         for case in range(cases):
             path, may_be_read = door.make(random.Random(f"{seed} {case}"))
             where = f"{kind}, seed {seed}, case {case}"
-            before, start = _reset_peak(), time.process_time()
+            before, start = reset_peak(), time.process_time()
             try:
                 door.read(path)
                 if not may_be_read:
@@ -519,7 +518,7 @@ def run_cases(kind: str, cases: int, seed: int) -> dict[str, Any]:
                     failures.append(f"{where}: {type(error).__name__}: {said[:300]}")
             except BaseException as error:
                 failures.append(f"{where}: {type(error).__name__}: {str(error)[:300]}")
-            seconds, grown = time.process_time() - start, _memory("VmHWM") - before
+            seconds, grown = time.process_time() - start, memory("VmHWM") - before
             size = path.stat().st_size
             if seconds > SECONDS:
                 failures.append(f"{where}: took {seconds:.1f} s")
@@ -537,16 +536,6 @@ def _is_ours(error: BaseException) -> bool:
     while place is not None and place.tb_next is not None:
         place = place.tb_next
     return place is not None and PACKAGE in Path(place.tb_frame.f_code.co_filename).parents
-
-
-def _reset_peak() -> int:
-    Path("/proc/self/clear_refs").write_text("5")
-    return _memory("VmRSS")
-
-
-def _memory(key: str) -> int:
-    status = Path("/proc/self/status").read_text()
-    return 1024 * int(status.split(f"{key}:")[1].split()[0])
 
 
 def in_a_child(cases: dict[str, int], seed: int) -> list[dict[str, Any]]:
