@@ -1,9 +1,9 @@
-"""Local refinement: a motion that is nearly right, made precise. One file per way, one table.
+"""Local refinement makes a nearly right motion precise. One file per method, and one table.
 
-A refinement is a function `refine(source, target, initial, **options) -> Fit`: two surfaces in the
-unit sphere and the (4, 4) motion of the source onto the target to start from (`surfaces` has the
-types). A new one is a file with such a function, and a line in the table; `add` puts one there from
-outside the package.
+A refinement is a function `refine(source, target, initial, **options) -> Fit`. It gets two surfaces
+in the unit sphere and a (4, 4) motion of the source onto the target, from which it starts
+(`surfaces` has the types). To add one, write a file with such a function and add a line to the
+table. `add` registers one from outside the package.
 """
 
 from __future__ import annotations
@@ -23,35 +23,36 @@ DEFAULT = "own"
 
 @dataclass(frozen=True)
 class Refinement:
-    """One way to refine; called like the function it stands for."""
+    """One refinement method. Call it like the function that it names."""
 
     name: str
     title: str
-    """What it is, for people."""
+    """A description for people."""
     home: str | Callable[..., Fit]
-    """The function, or where it is, as "module:function", to be imported on first use."""
+    """The function, or its location as "module:function", which is imported on first use."""
     traceable: bool = False
-    """Whether JAX can trace it. Then it is part of the network's program and gets ``Surface``
-    objects. All others run on the host and get ``HostSurface`` objects."""
+    """Whether JAX can trace it. If so, it becomes part of the network's program and gets
+    ``Surface`` objects. All others run on the host and get ``HostSurface`` objects."""
     every_point: bool = False
     """Whether it gets all points of the clouds, and not only those that the network saw."""
     library: str | None = None
-    """An optional library that it needs."""
+    """The optional library that it needs, if any."""
 
     def __call__(self, source: Any, target: Any, initial: Any, **options: Any) -> Fit:
-        """The fit found from `initial`; raises ModuleNotFoundError without its library."""
+        """Returns the fit found from `initial`. Raises ModuleNotFoundError if its library is
+        missing."""
         self.require()
         return self.function()(source, target, initial, **options)
 
     def function(self) -> Callable[..., Fit]:
-        """The function itself."""
+        """The function itself, imported if necessary."""
         if not isinstance(self.home, str):
             return self.home
         module, _, name = self.home.partition(":")
         return getattr(importlib.import_module(module), name)
 
     def require(self) -> None:
-        """Raises ModuleNotFoundError, with the way out, where its library is missing."""
+        """Raises ModuleNotFoundError if its library is missing, and says how to install it."""
         if self.library is not None:
             require(self.library)
 
@@ -91,17 +92,21 @@ def names() -> tuple[str, ...]:
 
 
 def add(refinement: Refinement) -> None:
-    """Puts a refinement into the table. Raises ValueError where its name is taken."""
+    """Puts a refinement into the table. Raises ValueError if its name is taken or contains a
+    colon."""
     if refinement.name in _TABLE or ":" in refinement.name:
-        raise ValueError(f"name: got {refinement.name!r}, wanted one that is not taken, without :")
+        raise ValueError(
+            f"name: got {refinement.name!r}, wanted a name that is not taken and has no colon"
+        )
     _TABLE[refinement.name] = refinement
 
 
 def refinement(name: str) -> Refinement:
-    """The refinement of that name.
+    """The refinement with this name.
 
-    "module:function" is a function anywhere, which runs on the host: so commands and configs name
-    what their process has in no table. Raises ValueError for another name.
+    "module:function" names any importable function, which then runs on the host. This is how
+    commands and configs use a refinement that is not in the table of their process. Raises
+    ValueError for any other name.
     """
     if isinstance(name, str) and name in _TABLE:
         return _TABLE[name]
@@ -114,7 +119,8 @@ def refinement(name: str) -> Refinement:
 
 
 def find(refine: bool | str) -> Refinement | None:
-    """The refinement that an option asks for: by name, the usual one for True, none for False."""
+    """The refinement that an option asks for: the named one, the default for True, or None for
+    False."""
     if isinstance(refine, bool):
         return refinement(DEFAULT) if refine else None
     return refinement(refine)

@@ -1,7 +1,7 @@
-"""The last refinement: on every point of the clouds, from a motion found on a few of them.
+"""The last refinement. It uses every point of the clouds and starts from a motion found on a few.
 
-It is the generalized ICP (Segal, Haehnel & Thrun, 2009) of the library small_gicp (Koide, 2024).
-Where that library is missing, `pyramid` does the same work with our own code, more slowly.
+It runs generalized ICP (Segal, Haehnel & Thrun, 2009) from the library small_gicp (Koide, 2024). If
+that library is missing, `pyramid` does the same work with our own code, more slowly.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from cfr_jax.refine.surfaces import Fit, HostSurface, closest
 from cfr_jax.runtime.optional import require
 
 MOST = 30_000
-"""Clouds with more points are thinned to about so many for the descent."""
+"""Clouds with more points than this are thinned to at most this many for the descent."""
 _NEIGHBORS = 10
 _ITERATIONS = 30
-# Radians and units of the unit sphere. Pairs come and go at the cut, so that smaller steps hardly
-# end: on LiDAR scans and rooms a twentieth of it took three times as many and changed no error.
+# In radians and in units of the unit sphere. Pairs come and go at the cut, so with a much smaller
+# tolerance the descent hardly ends: on LiDAR scans and rooms, a twentieth of this one took three
+# times as many steps and changed no error.
 _SETTLED = 2e-4
 # Pairs further apart than this many times the median distance are rejected. The median is about
-# half the spacing where the clouds lie on each other, and the noise where they are noisy.
+# half the point spacing where the clouds are aligned, and about the noise where they are noisy.
 _SPREADS = 3.0
-_LEAST_CUT = 1e-4  # for the same points twice
-# A second descent is worth its time only where the first has brought the clouds much closer.
+_LEAST_CUT = 1e-4  # for two copies of the same points, whose median distance is zero
+# A second descent is worth its time only if the first one brought the clouds much closer.
 _MUCH_CLOSER = 0.7
 _ROUNDS = 3
 _WIDER = 1.1  # a voxel grid this much coarser than the last one tried
@@ -40,8 +41,8 @@ def refine(source: HostSurface, target: HostSurface, initial: Float[np.ndarray, 
     """Refines `initial`, which maps source onto target within the unit sphere.
 
     The result is kept only if it scores no worse than `initial` on all points. The same clouds give
-    the same answer, to the bit: the library sums in one thread, as its sums depend on the order in
-    which its threads finish.
+    the same answer, bit by bit: the library runs in one thread, because the order in which several
+    threads finish would change its sums.
     """
     if importlib.util.find_spec("small_gicp") is None:
         return pyramid.refine(source, target, initial)
@@ -60,7 +61,7 @@ def refine(source: HostSurface, target: HostSurface, initial: Float[np.ndarray, 
             init_T_target_source=transform,
             registration_type="GICP",
             max_correspondence_distance=cut,
-            num_threads=1,  # its sums are not the same twice with more
+            num_threads=1,  # with more threads, its sums differ from run to run
             max_iterations=_ITERATIONS,
             rotation_epsilon=_SETTLED,
             translation_epsilon=_SETTLED,
@@ -75,12 +76,13 @@ def refine(source: HostSurface, target: HostSurface, initial: Float[np.ndarray, 
 def distances(
     source: HostSurface, target: HostSurface, transform: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, " n"]:
-    """From each point of the moved source to the closest point of the target."""
+    """The distance from each point of the moved source to the closest point of the target."""
     return closest(source, target, transform)[1]
 
 
 def score(distance: Float[np.ndarray, " n"], cut: float) -> float:
-    """`generalized_icp.scores` of these distances: 0 is best, 1 where nothing is near."""
+    """The same score as `generalized_icp.scores`, for these distances: 0 is best, and 1 means that
+    no point is within the cut."""
     return float(np.mean(1 - (1 - np.minimum(distance / cut, 1) ** 2) ** 3))
 
 
@@ -91,7 +93,7 @@ def _cut(distance: Float[np.ndarray, " n"], cut: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """What the library works on: a cloud with covariances, and its tree."""
+    """The library's own objects: a cloud with covariances, and its KD-tree."""
 
     cloud: Any
     tree: Any
@@ -112,10 +114,11 @@ def _level(surface: HostSurface) -> _Level:
 
 
 def _thinned(points: Float[np.ndarray, "n 3"]) -> Any:
-    """The library's cloud of the means of the points in each voxel, of at most `MOST` voxels.
+    """A cloud of the library with one point per voxel, the mean of the points in it. There are at
+    most `MOST` voxels.
 
-    The edge of a voxel comes from the cloud: on a surface, twice the edge leaves a quarter of the
-    voxels.
+    The edge length of a voxel depends on the cloud: on a surface, doubling the edge leaves a
+    quarter of the voxels.
     """
     small_gicp = require("small_gicp")
     edge = 1 / np.sqrt(MOST)

@@ -1,9 +1,9 @@
 """Local refinement of a registration: generalized ICP with a shrinking, robust cut.
 
-The network brings a cloud to within a few degrees; what is left is a smooth least-squares problem.
-Generalized ICP (Segal, Haehnel & Thrun, 2009) models each point as a small plane: it forgives a
-wide cut better than point-to-plane distances do, and needs only the direction of normals, not their
-sign.
+The network brings a cloud to within a few degrees of the target. What is left is a smooth
+least-squares problem. Generalized ICP (Segal, Haehnel & Thrun, 2009) models each point as a small
+plane. It copes with a wide cut better than point-to-plane distances do, and it needs only the
+direction of the normals, not their sign.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ _HIGHEST = lax.Precision.HIGHEST
 
 
 class Stage(NamedTuple):
-    """How far points may be from each other, and what shape they have."""
+    """How far apart paired points may be, and the shape of the small plane at each point."""
 
     cut: float
-    """In units of the unit sphere."""
+    """The largest distance of a pair, in units of the unit sphere."""
     thickness: float
-    """Variance of a point's plane across it, as a share of that along it."""
+    """The variance of a point across its plane, as a share of the variance along the plane."""
 
 
-# Wide enough at first for what a network leaves, and at last no wider than the surface's own noise
-# and spacing. Thin planes slide past each other and find the way from afar; thick ones, between
-# planes and balls, use the points themselves, and end more precisely on noisy clouds.
+# The first cut is wide enough for the error that a network leaves. The last is no wider than the
+# noise and the spacing of the surface. Thin planes slide past each other, so they converge from
+# afar. Thick ones, halfway between planes and balls, also use the points themselves and end more
+# precisely on noisy clouds.
 STAGES = (Stage(0.2, 0.01), Stage(0.1, 0.01), Stage(0.05, 0.1))
 CUT = STAGES[-1].cut
 _STEPS_PER_CUT = 12
-_SETTLED = 1e-5  # radians and units: smaller updates end a stage
+_SETTLED = 1e-5  # radians and units of the unit sphere; a smaller update ends a stage
 
 
 def refine(
@@ -49,8 +50,8 @@ def refine(
 ) -> Fit:
     """Refines `initial`, which maps source onto target, within the unit sphere.
 
-    Where `descend` ends is kept only if it scores no worse than `initial` (`score` at the last
-    cut).
+    The motion at which `descend` ends is kept only if it scores no worse than `initial` (`scores`
+    at the last cut).
     """
     transform, steps, settled = descend(source, target, initial, stages)
     before, after = scores(source, target, jnp.stack([initial, transform]), stages[-1].cut)
@@ -64,11 +65,12 @@ def descend(
     initial: Float[Array, "4 4"],
     stages: tuple[Stage, ...] = STAGES,
 ) -> tuple[Float[Array, "4 4"], Int[Array, ""], Bool[Array, ""]]:
-    """Where generalized ICP ends, in how many steps, and whether the last stage came to rest.
+    """Runs generalized ICP. Returns the motion at which it ends, the number of steps, and whether
+    the last stage settled.
 
-    In each stage: pair every source point with its closest target point, weigh the pairs
-    down to zero at the cut (Tukey's biweight), take a Gauss-Newton step on SE(3), until nothing
-    moves.
+    Each stage repeats three things until nothing moves: it pairs every source point with its
+    closest target point, gives the pairs weights that fall to zero at the cut (Tukey's biweight),
+    and takes a Gauss-Newton step on SE(3).
     """
 
     def run(transform: Array, stage: Stage) -> tuple[Array, tuple[Array, Array]]:
@@ -83,10 +85,11 @@ def descend(
 def scores(
     source: Surface, target: Surface, transforms: Float[Array, "k 4 4"], cut: float
 ) -> Float[Array, " k"]:
-    """Mean over the source of Tukey's biweight loss of the distance to the target, under each of
-    the `transforms`; in [0, 1].
+    """The mean of Tukey's biweight loss over the points of the source, under each of the
+    `transforms`; in [0, 1].
 
-    It is 1 - (1 - d^2 / cut^2)^3, and 1 beyond the cut: what the weights of a descent belong to.
+    A point at distance d from the target has the loss 1 - (1 - d^2 / cut^2)^3, or 1 beyond the cut.
+    The weights in `descend` are those of this loss.
     """
     square = squared_distances(source, target, transforms)
     loss = 1 - jnp.maximum(1 - square / cut**2, 0) ** 3
@@ -97,8 +100,8 @@ def scores(
 def squared_distances(
     source: Surface, target: Surface, transforms: Float[Array, "k 4 4"]
 ) -> Float[Array, "k n"]:
-    """From each point of the source, moved by each of the `transforms`, to the closest of the
-    target: one search for all of them."""
+    """The squared distance from each point of the source, moved by each of the `transforms`, to the
+    closest point of the target. One search serves all transforms."""
     moved = jax.vmap(rigid.apply, (0, None))(transforms, source.points)
     found = closest(moved.reshape(-1, 3), target.points, target.mask)
     return found.square.reshape(moved.shape[:2])
@@ -122,7 +125,7 @@ def _run_stage(
 
 
 def _gauss_newton(source: Surface, target: Surface, transform: Array, stage: Stage) -> Array:
-    """The twist that lessens sum_i w_i r_i' M_i r_i the most, r = T x - y, linearized."""
+    """The twist that minimizes sum_i w_i r_i' M_i r_i, with r = T x - y linearized in the twist."""
     found = closest(rigid.apply(transform, source.points), target.points, target.mask)
     partners = target.points[found.index], target.normals[found.index]
     return solve(*normal_equations(source, *partners, transform, stage))
@@ -135,8 +138,9 @@ def normal_equations(
     transform: Float[Array, "4 4"],
     stage: Stage,
 ) -> tuple[Float[Array, "6 6"], Float[Array, " 6"]]:
-    """What one Gauss-Newton step solves, summed over the pairs of source points and partners;
-    sums over parts of a cloud add up. Pairs further apart than the cut have no say."""
+    """The normal equations of one Gauss-Newton step, summed over the pairs of source points and
+    partners. The sums over parts of a cloud can be added up. Pairs further apart than the cut have
+    weight zero."""
     moved = rigid.apply(transform, source.points)
     residual = moved - partners
     weight = jnp.maximum(1 - jnp.sum(residual**2, axis=1) / stage.cut**2, 0) ** 2
@@ -155,20 +159,23 @@ def normal_equations(
 
 
 def solve(system: Float[Array, "6 6"], pull: Float[Array, " 6"]) -> Float[Array, " 6"]:
-    """The step: a left twist, rotation first."""
-    # keeps directions that nothing determines (a line turning about itself) at rest
+    """Solves the normal equations for the step, a left twist with the rotation first."""
+    # damping gives no motion along directions that the pairs do not determine, such as the turn
+    # of a line about itself
     damping = 1e-6 * jnp.trace(system) + jnp.finfo(system.dtype).tiny
     return -solve_positive(system + damping * jnp.eye(6, dtype=system.dtype), pull)
 
 
 def _plane(normals: Array, thickness: Array | float) -> Array:
-    """Covariance of a small plane: thin along the normal, one across; round where there is none."""
+    """The covariance of a small plane: `thickness` along the normal and 1 within the plane. Where
+    the normal is zero, it is the identity, a ball."""
     outer = normals[:, :, None] * normals[:, None, :]
     return jnp.eye(3, dtype=normals.dtype) - (1 - thickness) * outer
 
 
 def _inverse_symmetric(m: Array) -> Array:
-    """Inverses of (n, 3, 3) symmetric matrices by cofactors; ours are far from singular."""
+    """The inverses of (n, 3, 3) symmetric matrices, by cofactors. Those used here are far from
+    singular."""
     a, b, c = m[:, 0, 0], m[:, 0, 1], m[:, 0, 2]
     d, e, f = m[:, 1, 1], m[:, 1, 2], m[:, 2, 2]
     cofactors = jnp.stack(

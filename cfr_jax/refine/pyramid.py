@@ -1,10 +1,10 @@
 """Refinement on all points of large clouds, from an answer found on thinned ones.
 
 It is the usual pyramid of voxel grids. The network and the first refinement see a thousand points.
-Then follow a grid with eight times as many points and the clouds themselves, each with a narrower
-cut. The steps are those of `generalized_icp`. The closest points come from a KD-tree on the host,
-and the sums are taken over a few thousand pairs at a time, so that memory grows with the clouds
-only.
+Next comes a grid with eight times as many points, and then the clouds themselves, each with a
+narrower cut. The steps are those of `generalized_icp`. The closest points come from a KD-tree on
+the host. The sums are taken over a few thousand pairs at a time, so memory use grows only with the
+size of the clouds.
 """
 
 from __future__ import annotations
@@ -29,13 +29,14 @@ from cfr_jax.refine.surfaces import Fit, HostSurface, Surface
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-_FULLER = 8  # points of the middle level, as a multiple of the network's
-_NEIGHBORS = 24  # a normal's neighborhood; shrinks with the spacing
+_FULLER = 8  # points of the middle level, as a multiple of the points that the network saw
+_NEIGHBORS = 24  # points that a normal is estimated from, so the radius shrinks with the spacing
 _THICKNESS = generalized_icp.STAGES[-1].thickness
-# The cut of a level: this many times the median distance of the pairs that it starts with, which
-# is about half the spacing where the clouds lie on each other, and noise where they are noisy.
+# The cut of a level is this many times the median distance of the pairs that it starts with. That
+# median is about half the point spacing where the clouds are aligned, and about the noise where
+# they are noisy.
 _SPREADS = 4.0
-_LEAST_CUT = 1e-4  # of the same points twice
+_LEAST_CUT = 1e-4  # for two copies of the same points, whose median distance is zero
 _MOST_STEPS = 20
 _SETTLED = 1e-6  # radians and units of the unit sphere
 _ROWS = 1 << 13
@@ -43,15 +44,15 @@ _ROWS = 1 << 13
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """A cloud on one grid, in the unit sphere."""
+    """A cloud thinned to one grid, in the unit sphere."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
 
     @functools.cached_property
     def tree(self) -> cKDTree:
-        """Of the points; a source needs none."""
-        # imported here: a fifth of a second that `align` alone need not wait for
+        """The KD-tree of the points. Only targets need one."""
+        # Importing scipy.spatial takes a fifth of a second, which most calls of `align` can avoid.
         from scipy.spatial import cKDTree
 
         return cKDTree(self.points)
@@ -60,8 +61,8 @@ class Level:
 def refine(source: HostSurface, target: HostSurface, initial: Float[np.ndarray, "4 4"]) -> Fit:
     """Refines `initial`, which maps source onto target within the unit sphere.
 
-    It came of `thinned_to` points of each. The result is kept only where it scores no worse than
-    `initial` on all points.
+    `initial` was found from `thinned_to` points of each surface. The result is kept only if it
+    scores no worse than `initial` on all points.
     """
     most = max(len(source.points), len(target.points))
     fuller = _FULLER * max(surface.thinned_to or most for surface in (source, target))
@@ -100,7 +101,8 @@ def _normals(points: np.ndarray) -> np.ndarray:
 def _pairs(
     source: Level, target: Level, transform: np.ndarray, cut: float | np.float32
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The closest target point of each source point, and its distance; infinite beyond the cut."""
+    """The distance from each moved source point to its closest target point, and that point's row.
+    The distance is infinite beyond the cut."""
     moved = motions.apply(transform, source.points)
     return target.tree.query(moved, distance_upper_bound=cut, workers=-1)
 
@@ -128,7 +130,7 @@ def _descend(
 def _twist(
     source: Level, target: Level, index: np.ndarray, transform: np.ndarray, stage: Stage
 ) -> np.ndarray:
-    """One Gauss-Newton step as a motion, its equations summed in float64."""
+    """One Gauss-Newton step as a motion. Its equations are summed in float64."""
     moving = jnp.asarray(transform, jnp.float32)
     system, pull = np.zeros((6, 6)), np.zeros(6)
     for start in range(0, len(index), _ROWS):
@@ -163,6 +165,6 @@ def _equations(
 
 
 def _score(source: Level, target: Level, transform: np.ndarray, cut: float) -> float:
-    """`generalized_icp.scores` of one motion, by the tree."""
+    """The same score as `generalized_icp.scores`, for one motion, computed with the KD-tree."""
     distance, _ = _pairs(source, target, transform, cut)
     return float(np.mean(1 - (1 - np.minimum(distance / cut, 1) ** 2) ** 3))

@@ -1,4 +1,4 @@
-"""Generalized ICP (Segal, Haehnel & Thrun, 2009), by the library small_gicp (Koide, 2024)."""
+"""Generalized ICP (Segal, Haehnel & Thrun, 2009) from the library small_gicp (Koide, 2024)."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ def refine(
     neighbors: int = 20,
     iterations: int = 100,
 ) -> Fit:
-    """GICP from `initial`, which maps source onto target, `iterations` for each of `distances`.
+    """Runs GICP from `initial`, which maps source onto target, once for each of `distances`, with
+    at most `iterations` each.
 
     Pairs further apart than the distance are rejected. The covariance of a point comes from its
-    `neighbors` nearest points; normals are not used. It does not check whether the result is
-    better than `initial`.
+    `neighbors` nearest points; normals are not used. This function does not check whether the
+    result is better than `initial`.
     """
     small_gicp = require("small_gicp")
     (moving, _), (cloud, tree) = (
@@ -39,7 +40,7 @@ def refine(
     )
     motion, converged, steps = initial, False, 0
     for distance in distances:
-        # small_gicp's usual tolerances are those of a car: 0.1 degrees and a millimeter
+        # small_gicp's default tolerances suit LiDAR on a car: 0.1 degrees and a millimeter
         found = small_gicp.align(
             cloud,
             moving,
@@ -57,7 +58,7 @@ def refine(
 
 
 def _prepared(points: Float[np.ndarray, "n 3"], neighbors: int) -> tuple[Any, Any]:
-    """The library's cloud with covariances, and its tree."""
+    """The library's cloud with covariances, and its KD-tree."""
     small_gicp = require("small_gicp")
     cloud = small_gicp.PointCloud(points)
     tree = small_gicp.KdTree(cloud)

@@ -1,4 +1,4 @@
-"""What refinements work on, and what they answer."""
+"""The surfaces that refinements work on, and the fit that they return."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 @struct.dataclass
 class Surface:
-    """Points with normals on the device, `mask` marking the valid rows."""
+    """Points with normals on the device. `mask` marks the valid rows."""
 
     points: Float[Array, "n 3"]
     normals: Float[Array, "n 3"]
@@ -32,19 +32,20 @@ class HostSurface:
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"] | None = None
-    """Unit normals, where the caller has some."""
+    """Unit normals, if the caller has some."""
     thinned_to: int | None = None
-    """How many of these points the motion to refine was found from; None for all of them."""
+    """The number of these points that the initial motion was found from; None if it was found from
+    all of them."""
     _made: dict[Hashable, Any] = field(default_factory=dict, repr=False)
 
     @functools.cached_property
     def tree(self) -> Tree:
-        """Of all points."""
+        """The KD-tree of all points."""
         return Tree(self.points)
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
-        """What `make` made of this surface, when it was first asked for under this `key`: trees,
-        covariances and the like, which many fits of one surface share."""
+        """Returns `make()`, computed once for each `key` and then remembered. Many fits of one
+        surface share its trees, covariances and so on in this way."""
         if key not in self._made:
             self._made[key] = make()
         return self._made[key]
@@ -53,20 +54,21 @@ class HostSurface:
 def closest(
     source: HostSurface, target: HostSurface, transform: Float[np.ndarray, "4 4"]
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """The row of the target's point closest to each point of the moved source, and the distance.
-    Asked for again, the answer is still there."""
+    """For each point of the moved source, the row of the closest point of the target, and the
+    distance to it. The answer is remembered for the next call with the same motion."""
     key = "closest", target, transform.tobytes()
     return source.once(key, lambda: target.tree.closest(motions.apply(transform, source.points)))
 
 
 @struct.dataclass
 class Fit:
-    """Answer of a refinement."""
+    """The answer of a refinement."""
 
     transform: Float[Array, "4 4"] | Float[np.ndarray, "4 4"]
     """Maps source onto target."""
     improved: Bool[Array, ""] | bool
-    """Whether `transform` is not the initial one, kept because the other scored worse."""
+    """Whether `transform` is the result of the refinement. False means that it scored worse than
+    the initial motion, which `transform` then is."""
     converged: Bool[Array, ""] | bool
-    """Whether the last stage ended because nothing moved any more."""
+    """Whether the last stage ended because nothing moved any longer."""
     steps: Int[Array, ""] | int

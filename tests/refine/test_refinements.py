@@ -1,4 +1,4 @@
-"""The table of refinements: what it holds, and how one from outside is put there and used."""
+"""The table of refinements: its entries, and how to add one from outside and use it."""
 
 import json
 
@@ -21,7 +21,7 @@ STEPS = 7
 
 
 def fit_points(source, target):
-    """Kabsch (1976), in numpy."""
+    """The rigid motion by Kabsch (1976), in numpy."""
     middles = source.mean(axis=0), target.mean(axis=0)
     u, _, vt = np.linalg.svd((target - middles[1]).T @ (source - middles[0]))
     u[:, 2] *= np.linalg.det(u @ vt)
@@ -32,7 +32,7 @@ def fit_points(source, target):
 
 
 def toy(source, target, initial):
-    """Point-to-point ICP, of a fixed number of steps."""
+    """Point-to-point ICP with a fixed number of steps."""
     assert isinstance(source, HostSurface) and source.points.dtype == np.float64
     tree = target.once("toy", lambda: cKDTree(target.points))
     for _ in range(STEPS):
@@ -42,7 +42,7 @@ def toy(source, target, initial):
 
 
 def shift(source, target, initial):
-    """Lays centroid on centroid, as JAX traces it."""
+    """Lays centroid on centroid, in a way that JAX can trace."""
     assert isinstance(source, Surface)
     middles = [jnp.mean(side.points, axis=0, where=side.mask[:, None]) for side in (source, target)]
     moved = initial.at[:3, 3].set(middles[1] - initial[:3, :3] @ middles[0])
@@ -51,7 +51,7 @@ def shift(source, target, initial):
 
 @pytest.fixture
 def table(monkeypatch):
-    """A table that is put back after the test."""
+    """The table of refinements, restored after the test."""
     monkeypatch.setattr(refine, "_TABLE", dict(refine._TABLE))
     refine.add(refine.Refinement("toy", "ICP for a test", toy))
     refine.add(refine.Refinement("shift", "centroids for a test", shift, traceable=True))
@@ -73,7 +73,7 @@ def test_a_refinement_from_outside_refines_what_the_network_answers(table, pair,
 
     assert np.array_equal(found.transforms, plain.transforms)
     assert found.steps == STEPS and found.refined and not found.converged
-    # what the toy does is seen in the points that the network saw, here all of them
+    # the toy's effect shows in the points that the network saw, which are all points here
     source, target = pair
     away = [
         np.square(cKDTree(target).query(solids.move(motion, source))[0]).mean()
@@ -149,7 +149,7 @@ def test_a_config_takes_it_by_name(table, pair):
 
 
 def test_a_name_is_given_once(table):
-    with pytest.raises(ValueError, match="^name: got 'toy', wanted one that is not taken"):
+    with pytest.raises(ValueError, match="^name: got 'toy', wanted a name that is not taken"):
         refine.add(refine.Refinement("toy", "again", toy))
 
 
