@@ -1,5 +1,5 @@
-"""The last refinement, on every point: exact, never worse, the same twice, with or without its
-library."""
+"""The last refinement uses every point. It is exact, never makes the score worse, gives the same
+answer twice, and works with or without its library."""
 
 import sys
 
@@ -27,12 +27,12 @@ def target(count, seed=1, noise=0.002):
 
 
 def source(count, seed=0, noise=0.002):
-    """The truth maps it back."""
+    """A cloud that TRUTH maps into the target's frame."""
     return HostSurface(solids.move(np.linalg.inv(TRUTH), target(count, seed, noise).points))
 
 
 def off(transform):
-    """Degrees and length by which a motion misses the truth."""
+    """The error of a motion: degrees of rotation, and length of translation."""
     left = np.linalg.inv(TRUTH) @ transform
     return np.degrees(Rotation.from_matrix(left[:3, :3]).magnitude()), np.linalg.norm(left[:3, 3])
 
@@ -41,7 +41,7 @@ def test_many_points_give_an_exact_answer(library):
     fine = all_points.refine(source(3000), target(3000), START)
 
     degrees, length = off(fine.transform)
-    assert degrees < 0.1 and length < 1e-3  # from a degree and a hundredth
+    assert degrees < 0.1 and length < 1e-3  # START is off by 1 degree and about 0.01
     assert fine.improved and fine.converged and fine.steps > 0
     motions.check_rigid("transform", fine.transform)
 
@@ -78,7 +78,7 @@ def test_it_never_scores_worse_than_its_start(library, seed):
     tree = cKDTree(still.points)
     away = [tree.query(solids.move(motion, moving.points))[0] for motion in (start, fine.transform)]
     scores = [all_points.score(distance, 0.05) for distance in away]
-    assert scores[1] <= scores[0] + 1e-3  # the cut it is judged by is narrower than this one
+    assert scores[1] <= scores[0] + 1e-3  # `refine` judges itself by a narrower cut than 0.05
     assert fine.improved or np.array_equal(fine.transform, start)
 
 

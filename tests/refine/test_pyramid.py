@@ -1,4 +1,4 @@
-"""Refinement on all points: as exact as many points allow, never worse than what it was given."""
+"""Refinement on all points is as exact as many points allow, and never worse than its start."""
 
 import numpy as np
 import pytest
@@ -14,14 +14,14 @@ TRUTH = solids.motion(20, (1.0, 2.0, 3.0), (0.1, -0.05, 0.2))
 def cloud(count, seed, *, moved=False, normals=False, noise=0.002):
     points, given = solids.lopsided(count, seed, noise)
     points = points - 0.4
-    if moved:  # the source: the truth maps it back
+    if moved:  # a source, which TRUTH maps into the target's frame
         inverse = np.linalg.inv(TRUTH)
         points, given = solids.move(inverse, points), given @ inverse[:3, :3].T
     return HostSurface(points, given if normals else None, 100)
 
 
 def off(transform):
-    """Degrees and length by which a motion misses the truth."""
+    """The error of a motion: degrees of rotation, and length of translation."""
     left = np.linalg.inv(TRUTH) @ transform
     turned = Rotation.from_matrix(left[:3, :3]).magnitude()
     return np.degrees(turned), np.linalg.norm(left[:3, 3])
@@ -38,7 +38,7 @@ def test_many_points_give_an_exact_answer(normals):
     fine = pyramid.refine(source, target, START)
 
     degrees, length = off(fine.transform)
-    assert degrees < 0.1 and length < 1e-3  # from a degree and a hundredth
+    assert degrees < 0.1 and length < 1e-3  # the start is off by 1 degree and about 0.01
     assert fine.improved and fine.converged
 
 

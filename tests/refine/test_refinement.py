@@ -1,4 +1,5 @@
-"""Generalized ICP: what it recovers, what it never does, and an independent minimizer."""
+"""Generalized ICP recovers known motions, never makes the score worse, and agrees with an
+independent minimizer."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ def SCORE(source, target, transform):  # noqa: N802
 
 
 def surface(sampled, transform=None):
-    """A surface of SIZE rows, padded, moved by `transform`."""
+    """A surface moved by `transform` and padded to SIZE rows."""
     points, normals = sampled
     if transform is not None:
         points, normals = solids.move(transform, points), normals @ transform[:3, :3].T
@@ -46,7 +47,7 @@ def test_a_known_motion_is_recovered_from_noisy_overlapping_views(axis, kept):
     truth = solids.motion(40)
     source = solids.keep_side(solids.lopsided(500, 0, 0.005), (1, 0, 0.3), kept)
     target = solids.keep_side(solids.lopsided(500, 1, 0.005), (-1, 0.5, 0.3), kept)
-    # off in the source's frame, where it is largest
+    # the start is off in the source's frame, where the error is largest
     initial = truth @ np.asarray(start(8, (0.05, -0.05, 0.03), axis), np.float64)
 
     found = REFINE(surface(source), surface(target, truth), jnp.asarray(initial, jnp.float32))
@@ -77,7 +78,7 @@ def test_what_would_score_worse_is_not_taken(monkeypatch):
         generalized_icp, "descend", lambda *_: (away, jnp.int32(1), jnp.array(True))
     )
 
-    # a program of its own: nothing compiled before knows of the other descent
+    # a new jit, because programs compiled before would still use the unpatched `descend`
     found = jax.jit(lambda initial: generalized_icp.refine(source, target, initial))(start(1))
 
     assert not bool(found.improved) and np.array_equal(found.transform, start(1))
@@ -108,7 +109,7 @@ def test_a_plane_comes_to_lie_on_a_plane_and_hardly_moves_in_it():
 
     height = solids.move(found, np.asarray(source.points)[:500])[:, 2]
     assert np.abs(height).max() < 1e-3
-    # no further along it than to where the samples meet best, which is within their spacing
+    # within the plane it slides only to where the samples meet best, less than their spacing away
     assert np.abs(found[:2, 3] - np.asarray(initial)[:2, 3]).max() < 0.09
 
 
@@ -152,12 +153,13 @@ def test_padding_changes_nothing():
 
 
 def oracle_icp(source, target, initial, stage, rounds=40):
-    """The fixed point, in float64, each round solved by scipy: pairs, weights and metric held."""
+    """The fixed point of the iteration, in float64. In each round the pairs, weights and metric are
+    held fixed, and scipy solves for the motion."""
     transform, tree = np.array(initial, np.float64), cKDTree(target.points)
     for _ in range(rounds):
         moved = solids.move(transform, source.points)
         distance, partner = tree.query(moved)
-        weight = np.maximum(1 - (distance / stage.cut) ** 2, 0)  # its square weighs a square
+        weight = np.maximum(1 - (distance / stage.cut) ** 2, 0)  # a residual's; squared in the cost
         planes = [
             np.eye(3) - (1 - stage.thickness) * normals[:, :, None] * normals[:, None, :]
             for normals in (source.normals @ transform[:3, :3].T, target.normals[partner])
@@ -185,7 +187,7 @@ def test_it_ends_where_an_independent_minimizer_of_the_same_cost_does(thickness)
     initial = solids.motion(3, translation=(0.02, 0, 0.01))
     wanted = oracle_icp(source, target, initial, stage)
 
-    # the same stage four times over: as many steps as it may need
+    # the same stage four times, so that it has as many steps as it may need
     found = REFINE(
         surface(source), surface(target), jnp.asarray(initial, jnp.float32), stages=(stage,) * 4
     )
