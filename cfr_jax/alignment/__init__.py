@@ -1,1 +1,1 @@
-"""A user's two clouds in; the motion between them, and how far to trust it, out."""
+"""Takes a user's two clouds and finds the motion between them, and how far to trust it."""

@@ -1,4 +1,4 @@
-"""`align`: two clouds of one thing, any size, units and offset, and the motion between them."""
+"""`align` finds the motion between two clouds of one thing, of any size, units and offset."""
 
 from __future__ import annotations
 
@@ -42,32 +42,44 @@ def align(
 ) -> Alignment:
     """Finds the rigid motion that lays `source` on `target`.
 
-    Clouds are (n, 3) arrays, (n, 6) with normals, paths, or anything else that `io.as_point_cloud`
-    takes. They are centered and scaled in float64, thinned to `max_points` each (default 1,024;
-    `seed` says which), given normals if they have none, and registered by the network with `params`
-    (default: the weights that ship) in two cascades. Then the answer is refined: by our generalized
-    ICP, by another refinement in the table of `cfr_jax.refine` (`refine="small_gicp"`), or not at
-    all (False). If a cloud was thinned, a last refinement uses all points of both
-    (`refine.all_points`), and `fitness`, `inlier_rmse`, `overlap` and `information` are those of
-    all points; with `all_points=False` everything stays with the thinned clouds. A refinement never
-    makes the score worse.
+    A cloud is an (n, 3) array, an (n, 6) array with normals, a path, or anything else that
+    `io.as_point_cloud` accepts. Both clouds are centered and scaled in float64, and thinned to
+    `max_points` each (default 1,024; `seed` determines which points are kept). Normals are
+    estimated if a cloud has none. The network with `params` (default: the shipped weights) then
+    registers the clouds in two cascades.
 
-    `initial` (4, 4) moves the source close to the target first. Without it, the centroids are laid
-    on each other. The network is trained for up to 45 degrees about each axis from there. A given
-    start is also refined as it is, and its answer is kept where the clouds then lie better on each
-    other than after the network, told by all points both ways (`measuring.misfit`). If there are
-    several starts (k, 4, 4), all are tried on thinned clouds, and the one from which the clouds fit
-    best is taken. "global" also tries starts that cover all rotations (`search`), and takes what it
-    finds where it is clearly better than the answer without them. This takes several times as long,
-    and also reports other motions that fit about as well. "auto" does so only where the confidence
-    in that answer is below one half. Without `initial`, a refined answer that is not trusted gets a
-    `second_look`: some starts around the first, and the clouds as they lie, are tried in the same
-    way, and the answer that is more likely right is kept (weights without calibration cannot tell,
-    and get no second look). The same call gives the same answer, bit by bit, on the same machine.
+    `refine` says how this answer is refined: with our own generalized ICP (True), with another
+    refinement from the table of `cfr_jax.refine` (such as "small_gicp"), or not at all (False). If
+    a cloud was thinned, a last refinement uses all points of both clouds (`refine.all_points`), and
+    `fitness`, `inlier_rmse`, `overlap` and `information` are measured on all points. With
+    `all_points=False`, everything is computed on the thinned clouds. A refinement never makes the
+    score worse.
 
-    Raises ValueError for clouds without extent or with fewer than 3 points, wrong shapes, values
-    that are not finite, and an `initial` that is no rigid motion or leaves the clouds far apart;
-    `io.CloudFileError` for files; ModuleNotFoundError if the library of `refine` is missing.
+    `initial` says where to start. Without it, the centroids are laid on each other. The network is
+    trained for rotations of up to 45 degrees about each axis from the start.
+
+    - A (4, 4) motion moves the source close to the target first. This start is also refined without
+      the network. That answer is kept if the clouds then fit better than after the network, as
+      measured on all points in both directions (`measuring.misfit`).
+    - Several motions (k, 4, 4) are all tried on thinned clouds. The one from which the clouds fit
+      best is used as the start.
+    - "global" also tries starts that cover all rotations (`search`), and takes the motion that it
+      finds if this is clearly better than the answer without them. This takes several times as
+      long, and also reports other motions that fit about as well.
+    - "auto" does the same as "global", but only if the confidence in the answer without these
+      starts is below one half.
+
+    If there is no `initial` and the refined answer is not trusted, it gets a `second_look`: the
+    clouds as they lie, and some starts around the first one, are tried in the same way. Whichever
+    answer is more likely right is kept. Weights without a calibration cannot tell which one that
+    is, so they get no second look.
+
+    The same call gives the same answer, bit by bit, on the same machine.
+
+    Raises ValueError for clouds without extent or with fewer than 3 points, for wrong shapes, for
+    values that are not finite, and for an `initial` that is not a rigid motion or that leaves the
+    clouds far apart. Raises `io.CloudFileError` for bad files, and ModuleNotFoundError if the
+    library of `refine` is missing.
     """
     began = time.perf_counter()
     refinements = chosen_refinements(refine, all_points=all_points)
@@ -88,7 +100,8 @@ def align(
 
 
 def chosen_refinements(refine: bool | str, *, all_points: bool = True) -> tuple[Refinement, ...]:
-    """The refinements that `align` runs, in order, after a check that their libraries are there."""
+    """The refinements that `align` runs, in order. Raises ModuleNotFoundError if a library that
+    one of them needs is missing."""
     first = find(refine)
     if first is None:
         return ()
@@ -107,7 +120,8 @@ def chosen_refinements(refine: bool | str, *, all_points: bool = True) -> tuple[
 def steps(
     plan: Plan, refinements: tuple[Refinement, ...], *, second_look: bool
 ) -> Iterator[Callable[[Case], Case]]:
-    """The steps from a plan to its answer; each takes the case as the step before left it."""
+    """The steps from a plan to its answer. Each step takes the case that the previous one
+    returned."""
     if plan.starts is not None and plan.start_given:
         yield search
     yield functools.partial(solve_case, refine=_traced(refinements))
@@ -117,7 +131,7 @@ def steps(
 def after_network(
     plan: Plan, refinements: tuple[Refinement, ...], *, second_look: bool
 ) -> Iterator[Callable[[Case], Case]]:
-    """The steps from what the network found for a plan to its answer."""
+    """The steps from the network's answer for a plan to the final answer."""
     traced, last = _traced(refinements), tuple(on_host(plan, refinements))
     if second_look and traced is not None:
         yield functools.partial(look_again, refine=traced)
@@ -130,13 +144,16 @@ def after_network(
 
 
 def _traced(refinements: tuple[Refinement, ...]) -> Refinement | None:
-    """What is part of the network's program."""
+    """The refinement that is compiled into the network's program, if there is one."""
     return refinements[0] if refinements and refinements[0].traceable else None
 
 
 def on_host(plan: Plan, refinements: tuple[Refinement, ...]) -> Iterator[Callable[[Case], Case]]:
-    """The steps of refinements that run on the host. After another refinement, one on all points
-    is skipped where the network has seen them all: these are the points already refined on."""
+    """The steps of the refinements that run on the host.
+
+    A refinement on all points that follows another one is skipped if the network has seen all
+    points, because the first refinement has already used them all.
+    """
     for number, each in enumerate(refinements):
         if each.every_point and (plan.thinned or number == 0):
             yield functools.partial(refine_every_point, refine=each)
@@ -145,8 +162,9 @@ def on_host(plan: Plan, refinements: tuple[Refinement, ...]) -> Iterator[Callabl
 
 
 def checked_params(params: Any) -> Params:
-    """The weights that ship for None; raises ValueError for what are no parameters, and for a
-    calibration made of other clues than `align` finds."""
+    """Returns the parameters after checking them; None stands for the shipped weights. Raises
+    ValueError for anything that is not a set of parameters, and for a calibration that uses other
+    clues than those of `align`."""
     params = _default_params() if params is None else params
     check_params(params)
     if (fitted := calibration_of(params)) is not None:

@@ -1,4 +1,4 @@
-"""What `align` answers: the motion in the caller's frame and units, and how far to trust it."""
+"""The answer of `align`: the motion in the caller's frame and units, and how far to trust it."""
 
 from __future__ import annotations
 
@@ -15,60 +15,65 @@ from cfr_jax.networks.probability import calibration_of
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Answer of `align`; everything in the caller's frame and units.
+    """The answer of `align`. Everything is in the caller's frame and units.
 
-    `fitness`, `inlier_rmse`, `overlap` and `information` are measured on all points if these were
-    refined, otherwise on the points that the network saw. `clues` always come from the latter.
+    `fitness`, `inlier_rmse`, `overlap` and `information` are measured on all points if a refinement
+    used all points, and otherwise on the points that the network saw. `clues` always come from the
+    points that the network saw.
     """
 
     transform: Float[np.ndarray, "4 4"]
     """Maps source onto target: `transform @ [x; 1]` lies on the target. Float64."""
     transforms: Float[np.ndarray, "L 4 4"]
-    """What the network answered, one per iteration of its two cascades, before any refinement."""
+    """The network's answers before any refinement, one per iteration of its two cascades."""
     refined: bool
-    """Whether `transform` is not the network's last, but an answer that fits no worse: the
-    refinement's, or the start where that fits better still."""
+    """Whether `transform` differs from the network's last answer. It is then the refined motion, or
+    a start that fits better still; neither fits worse than the network's answer."""
     confidence: float | None
-    """Estimated probability, in [0, 1], that the motion is right to 5 degrees and 0.1 radii. None
-    where the weights carry no calibration."""
+    """The estimated probability, in [0, 1], that the motion is right to 5 degrees and 0.1 radii.
+    None if the weights carry no calibration."""
     clues: dict[str, float]
-    """What the confidence was estimated from (`confidence.Clues`)."""
+    """The numbers from which the confidence was estimated (`confidence.Clues`)."""
     determined: bool
-    """Whether the clouds determine the motion; false where one slides or turns on the other."""
+    """Whether the clouds determine the motion. False if one can slide or turn on the other."""
     fitness: float
-    """Share of the source that has a target point within `inlier_distance`."""
+    """The share of source points that have a target point within `inlier_distance`."""
     inlier_rmse: float
-    """Root mean square distance of those points."""
+    """The root mean square distance from these source points to their closest target points."""
     inlier_distance: float
     weights: Float[np.ndarray, " n"]
-    """How much of each used source point found a partner, in [0, 1]."""
+    """The weight of each source point that the network saw, in [0, 1]: how much of it found a
+    partner."""
     source_rows: Int[np.ndarray, " n"]
-    """Which source points the network saw."""
+    """The rows of the source points that the network saw."""
     target_rows: Int[np.ndarray, " m"]
+    """The rows of the target points that the network saw."""
     neighbors: int
-    """Neighbors per point; small clouds have fewer than the usual 64."""
+    """The number of neighbors per point. Small clouds have fewer than the usual 64."""
     warnings: tuple[str, ...]
-    """Why the answer should not be trusted, or what was done differently, in words."""
+    """Sentences that say why the answer should not be trusted, or what was done differently."""
     seconds: dict[str, float]
     """`compile` (zero if a program of this size existed already), `run`, and `total`."""
     converged: bool = False
-    """Whether the refinement ended because nothing moved any more; false without one."""
+    """Whether the refinement ended because nothing moved any longer. False without refinement."""
     steps: int = 0
-    """How many steps the refinement took."""
+    """The number of steps that the refinement took."""
     overlap: float = 0.0
-    """Estimated share of the source that the target saw, too."""
+    """The estimated share of the source that the target shows, too."""
     information: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
-    """Information matrix of the inliers, as Open3D's `get_information_matrix_from_point_clouds`
-    gives it: rotation first, about the origin of the target's frame."""
+    """The information matrix of the inliers, as `get_information_matrix_from_point_clouds` of
+    Open3D defines it: rotation first, about the origin of the target's frame."""
     initial: Float[np.ndarray, "4 4"] | None = None
-    """Where the network started, in the caller's frame: as given, or as found by a search."""
+    """The motion from which the network started, in the caller's frame, whether given or found by a
+    search. None if nothing moved the source before the network."""
     starts: int = 1
-    """How many starts were tried, those of a second look included."""
+    """The number of starts that were tried, including those of a second look."""
     alternatives: Float[np.ndarray, "a 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    """Other motions that a search found to fit about as well: the shape is nearly symmetric."""
+    """Other motions that fit about as well, found by a search. If there are any, the shape is
+    nearly symmetric."""
 
     def __eq__(self, other: object) -> bool:
-        """Whether all but the `seconds` are equal, bit by bit."""
+        """Whether all fields but `seconds` are equal, bit by bit."""
         if not isinstance(other, Alignment):
             return NotImplemented
         names = (each.name for each in fields(self) if each.name != "seconds")
@@ -76,8 +81,8 @@ class Alignment:
 
     @property
     def trusted(self) -> bool:
-        """Whether the motion is determined and more likely right than wrong, and that is known.
-        False where `alternatives` fit about as well."""
+        """Whether the clouds determine the motion and it is more likely right than wrong. False if
+        the confidence is unknown, or if `alternatives` fit about as well."""
         if self.confidence is None or len(self.alternatives):
             return False
         return self.determined and self.confidence >= doubts.TRUSTED
@@ -85,10 +90,10 @@ class Alignment:
     def to_open3d(self) -> Any:
         """The answer as an `open3d.pipelines.registration.RegistrationResult`.
 
-        `transformation`, `fitness` and `inlier_rmse` mean in Open3D what they mean here:
+        `transformation`, `fitness` and `inlier_rmse` mean the same in Open3D as here:
         `source.transform(result.to_open3d().transformation)` lays the source on the target. The
-        correspondences are soft here, so that `correspondence_set` stays empty. Raises
-        ModuleNotFoundError without Open3D.
+        correspondences here are soft, so `correspondence_set` stays empty. Raises
+        ModuleNotFoundError if Open3D is not installed.
         """
         try:
             from open3d.pipelines.registration import RegistrationResult
@@ -103,7 +108,7 @@ class Alignment:
 
 
 def answer(case: Case) -> Alignment:
-    """What was found of a case, in the caller's frame and units, and how far to trust it."""
+    """Turns a solved case into the answer in the caller's frame and units."""
     plan, found, searched = case.plan, case.solved(), case.searched
     frames = plan.frames
     transform = frames.to_caller(np.asarray(found.transform))
@@ -155,10 +160,11 @@ def answer(case: Case) -> Alignment:
 
 
 def left_open(case: Case, probability: float | None) -> Float[np.ndarray, " 6"] | None:
-    """The twist that the clouds do not determine, if there is one.
+    """A twist that the clouds do not determine, or None if there is none.
 
-    What a nudge of usual size finds free is asked again with one that fits the clouds. What would
-    be trusted is also turned far (`basins.free_turn`).
+    If a nudge of the usual size finds a direction free, this direction is tested again with a nudge
+    whose size suits the clouds (`basins.resistance`). If the answer would be trusted, large turns
+    are tried, too (`basins.free_turn`).
     """
     found, plan = case.solved(), case.plan
     resistance = np.asarray(found.quality.resistance, np.float64)

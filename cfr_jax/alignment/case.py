@@ -1,4 +1,4 @@
-"""A pair on its way from the plan to the answer, and what is known of it by then."""
+"""A pair on its way from the plan to the answer, with everything found so far."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ from cfr_jax.refine.surfaces import HostSurface
 
 @struct.dataclass
 class Found:
-    """What comes back from the device; batched after `vmap`. Arrays of numpy on the host."""
+    """The results that come back from the device. They have a batch axis after `vmap`, and are
+    numpy arrays once they are on the host."""
 
     registration: Registration
     transform: Float[Array, "*batch 4 4"] | Float[np.ndarray, "*batch 4 4"]
-    """Maps the source, as it was handed over, onto the target."""
+    """Maps the source, as it was sent to the device, onto the target."""
     improved: Bool[Array, "*batch"] | Bool[np.ndarray, "*batch"]
-    """Whether `transform` is not the network's last, but one that fits no worse."""
+    """Whether `transform` is a refined motion, or a start, that fits no worse than the network's
+    last answer, and not that answer."""
     converged: Bool[Array, "*batch"] | Bool[np.ndarray, "*batch"]
     steps: Int[Array, "*batch"] | Int[np.ndarray, "*batch"]
     quality: quality.Quality
@@ -33,19 +35,20 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What a search found; motions map source onto target, the one with the least misfit first."""
+    """The result of a search. Motions map source onto target; the one with the smallest misfit
+    comes first."""
 
     unit_motions: Float[np.ndarray, "k 4 4"]
-    """Of the unit clouds of the plan."""
+    """The motions of the plan's unit clouds."""
     motions: Float[np.ndarray, "k 4 4"]
-    """Of the caller's clouds."""
+    """The same motions, of the caller's clouds."""
     fits: Float[np.ndarray, " k"]
-    """`quality.mutual_fit` of each, on the points that the network sees."""
+    """The `quality.mutual_fit` of each motion, on the points that the network sees."""
     frames: units.Frames
     starts: int
-    """How many were tried."""
+    """The number of starts that were tried."""
     nearby: bool = False
-    """Whether only starts around where the source lay were."""
+    """Whether only starts around the source's own position were tried."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,21 +62,21 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What the steps of `align` hand on to each other: each takes a case and answers a case."""
+    """The state that the steps of `align` pass along: each step takes a case and returns one."""
 
     params: dict[str, Any]
     plan: Plan
     found: Found | None = None
-    """The answer so far, of the plan's unit clouds."""
+    """The answer so far, for the plan's unit clouds."""
     searched: Search | None = None
     """The last search for a better start, if there was one."""
     placed: Placed | None = None
-    """All points of the clouds, or those that the network saw where the plan has no others; None
-    until they are asked for. It stays when the source is started elsewhere."""
+    """All points of the clouds, or only those that the network saw if the plan has no others. None
+    until a step needs them. They stay the same if the network starts from another position."""
     seconds: dict[str, float] = field(default_factory=lambda: {"compile": 0.0, "run": 0.0})
-    """What all steps together took; each adds its own."""
+    """The time that all steps took together. Each step adds its own."""
 
     def solved(self) -> Found:
-        """The answer so far, of a case that has one."""
+        """The answer so far. The network must have run before."""
         assert self.found is not None, "the network comes first"
         return self.found
