@@ -1,4 +1,4 @@
-"""Why an answer should not be trusted, in words."""
+"""Doubts about an answer: warnings in words, and limits on its confidence."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from cfr_jax.alignment.planning import SETTINGS
 from cfr_jax.geometry import motions
 from cfr_jax.networks.probability import Calibration
 
-# Below this the fit hardly suffers when a cloud slides or turns. Of planes, spheres, cylinders,
-# cones and the like, sampled twice by 200 to 500 points with noise, 97% measured less along their
-# free directions; of partial views of real objects about three quarters measured more.
+# With a resistance below this, the fit hardly suffers when a cloud slides or turns. Among planes,
+# spheres, cylinders, cones and similar shapes, sampled twice with 200 to 500 noisy points, 97%
+# measured less along their free directions. Among partial views of real objects, about three
+# quarters measured more.
 FREE = 0.08
 TRUSTED = 0.5
-_HARDLY = 0.2  # of the source on the target: too little to say what the shapes determine
-_INLIERS = 30.0  # 21 of them allow a confidence of 0.5, a hundred one of 0.96
-# How many of a unit make a meter.
+_HARDLY = 0.2  # with less of the source on the target, nobody can say what the shapes determine
+_INLIERS = 30.0  # 21 inliers allow a confidence of 0.5, and a hundred allow 0.96
+# How many of each unit make a meter.
 _PER_METER = {"millimeters": 1000.0, "centimeters": 100.0, "inches": 39.3701, "feet": 3.28084,
               "meters": 1.0}  # fmt: skip
-_PARTS_APART = 2.0  # as views of one thing differ in radius, while units differ by ten or more
-_SIZES_APART = 5.0  # more than partial views of one thing differ in radius
+_PARTS_APART = 2.0  # views of one thing may differ in radius by this factor, units differ by more
+_SIZES_APART = 5.0  # partial views of one thing never differ in radius by as much as this
 
 
 def warnings_of(
@@ -37,10 +38,13 @@ def warnings_of(
     searched: bool,
     remarks: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """`free` is the twist that nothing determines, if there is one; `rivals` are the turns by which
-    other answers differ (`turns`); `probability` is None where the weights have no calibration;
-    `size_ratio` is the radius of the source over the target's; `searched` tells whether more than
-    one start was tried; `remarks` are what was said before (`Plan.remarks`)."""
+    """All warnings about an answer, in words.
+
+    `free` is a twist that the clouds do not determine, if there is one. `rivals` describes how the
+    alternative motions differ from the answer (`turns`). `probability` is None if the weights have
+    no calibration. `size_ratio` is the source's radius divided by the target's. `searched` tells
+    whether starts far from the first were tried. `remarks` come first (`Plan.remarks`).
+    """
     warnings = list(remarks)
     if not 1 / _SIZES_APART < size_ratio < _SIZES_APART:
         larger, smaller, times = "source", "target", size_ratio
@@ -53,11 +57,11 @@ def warnings_of(
     elif free is not None:
         warnings.append(f"the clouds do not determine the motion: they {_describe(free)} freely")
     if rivals:
-        warnings.append(f"nearly symmetric: fits about as well {' or '.join(rivals)}")
+        warnings.append(f"nearly symmetric: the source fits about as well {' or '.join(rivals)}")
     if probability is None:
         warnings.append(
-            "not to be trusted: how likely it is right is unknown, as these weights carry no "
-            "calibration (`cfr calibrate` fits one)"
+            "not to be trusted: these weights carry no calibration (`cfr calibrate` fits one), so "
+            "nothing is known about how likely the answer is right"
         )
     elif probability < TRUSTED:
         hint = "" if searched else '; clouds turned far need initial="global" (--global)'
@@ -79,13 +83,15 @@ def probability(
     inliers: float = math.inf,
     rivals: int = 0,
 ) -> float | None:
-    """That the answer is right: what the calibration says, but no more than can be known. None
-    without calibration.
+    """The probability that the answer is right: the calibration's, with three upper bounds. None
+    without a calibration.
 
-    It was fitted to clouds that meet, of hundreds of points and without rivals, and says nothing of
-    others. So three bounds hold beside it: the fitness, where the clouds hardly meet; 1/(1 + r) of
-    r rivals, which are as likely right; and 1 - exp(-n / 30) of n `inliers` (points of the source
-    that lie on the target), because a few points of noise can always be laid on a few others.
+    A calibration is fitted to clouds of hundreds of points that meet, without rivals, and does not
+    hold for others. So the probability is at most
+    - the fitness, if the clouds hardly meet;
+    - 1 / (1 + r) with r `rivals`, because each of them is as likely right as the answer;
+    - 1 - exp(-n / 30) with n `inliers` (points of the source that lie on the target), because a few
+      points of noise can always be laid on a few others.
     """
     told = confidence.of_alignment(fitted, clues)
     if told is None:
@@ -96,8 +102,8 @@ def probability(
 
 
 def _units_in_words(size_ratio: float) -> str:
-    """The units in which two clouds seem to be, with the factor that would make them one; empty
-    where no two usual units are so far apart."""
+    """A sentence that names the units of the two clouds, as guessed from their sizes, and the
+    factor that converts between them. Empty if no two common units explain the ratio."""
     off, factor, ours, theirs = min(
         (abs(math.log(size_ratio * theirs / ours)), theirs / ours, our_name, their_name)
         for our_name, ours in _PER_METER.items()
@@ -114,7 +120,8 @@ def _units_in_words(size_ratio: float) -> str:
 def turns(
     transform: Float[np.ndarray, "4 4"], others: Float[np.ndarray, "a 4 4"]
 ) -> tuple[str, ...]:
-    """By which turns `others` differ from `transform`, about axes of the target's frame."""
+    """Says in words how each of `others` differs from `transform`: by a turn about an axis of the
+    target's frame, or by a shift."""
     told = []
     for other in others:
         turn = motions.to_rotvec(other[:3, :3] @ transform[:3, :3].T)
@@ -134,7 +141,7 @@ def _describe(twist: np.ndarray) -> str:
 
 
 def direction(axis: Float[np.ndarray, " 3"]) -> str:
-    """A line through the origin, written as the unit vector whose largest part is positive."""
+    """The direction of a line, written as the unit vector whose largest component is positive."""
     axis = axis / np.linalg.norm(axis)
     axis = axis * np.sign(axis[np.abs(axis).argmax()])
     axis = axis.round(2) + 0.0  # no "-0.00"

@@ -1,4 +1,4 @@
-"""A pair made ready on the host: read, checked, centered, scaled and thinned."""
+"""Prepares a pair on the host: reads, checks, centers, scales and thins its clouds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cfr_jax.networks.inputs import Settings, refuse_masked
 
 DEFAULT_BUDGET = 1024
 SETTINGS = Settings()
-_SAMPLED = 2048  # points that show whether many come again and again
+_SAMPLED = 2048  # points that are looked at to find out whether many are repeated
 CASCADES = 2  # chosen on validation pairs (docs/training.md)
 
 
@@ -27,23 +27,24 @@ Initial = Float[np.ndarray, "4 4"] | Float[np.ndarray, "k 4 4"] | Literal["globa
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A pair made ready for the device."""
+    """A pair that is ready for the device."""
 
     frames: units.Frames
     source: units.UnitCloud
     target: units.UnitCloud
     seed: int = 0
     start_given: bool = False
-    """Whether somebody said where the source starts; else centroid lies on centroid."""
+    """Whether the caller or a search chose the start. Otherwise the centroids are laid on each
+    other."""
     if_doubted: bool = False
-    """Whether `starts` are tried only where the answer from the one start is not trusted."""
+    """Whether `starts` are tried only if the answer from the single start is not trusted."""
     starts: Float[np.ndarray, "s 4 4"] | None = None
-    """Motions of unit clouds to start from, of which a search takes the best; None where the one
-    start that there is has been made part of `frames`."""
+    """Motions of unit clouds to start from. A search takes the best of them. None if there is a
+    single start, which is then part of `frames`."""
     whole: tuple[PointCloud, PointCloud] | None = None
-    """The caller's clouds with all their points, where they are asked for."""
+    """The caller's clouds with all their points, if a refinement needs them."""
     remarks: tuple[str, ...] = ()
-    """What was done differently when the clouds were made ready, in words."""
+    """Sentences that say what was done differently when the clouds were prepared."""
 
     @property
     def thinned(self) -> bool:
@@ -52,7 +53,8 @@ class Plan:
         return any(len(cloud.points) > len(unit.rows) for cloud, unit in sides)
 
     def started_at(self, motion: Float[np.ndarray, "4 4"]) -> Plan:
-        """The same clouds, the source moved by `motion` of unit clouds first."""
+        """The plan for the same clouds with the source first moved by `motion`, a motion between
+        the unit clouds."""
         points = motions.apply(motion, self.source.points).astype(np.float32)
         points *= self.source.mask[:, None]
         normals = self.source.normals
@@ -70,7 +72,8 @@ class Plan:
 
 
 def read_clouds(source: Any, target: Any) -> tuple[PointCloud, PointCloud]:
-    """Both as clouds; raises ValueError, by name, for what is none or has too few points."""
+    """Reads both as point clouds. Raises ValueError, with the argument's name, for anything that is
+    not a point cloud or has fewer than 3 points."""
     for cloud, name in ((source, "source"), (target, "target")):
         refuse_masked(name, cloud, "leave their rows out")
     clouds = as_point_cloud(source, name="source"), as_point_cloud(target, name="target")
@@ -92,10 +95,11 @@ def planned(
     settings: Settings = SETTINGS,
     to_unit: Callable[..., units.UnitCloud] = units.to_unit,
 ) -> Plan:
-    """Reads, centers, scales and thins a pair; arguments and errors are those of `align`.
+    """Reads, centers, scales and thins a pair. Arguments and errors are those of `align`.
 
-    The plan keeps the `whole` clouds on demand. Without `search` it leaves the search for
-    neighbors to the device. `to_unit` may stand in for `units.to_unit`, and remember what it made.
+    With `whole`, the plan also keeps the clouds with all their points. With `search=False`, it
+    leaves the search for neighbors to the device. A caller can replace `units.to_unit` with a
+    `to_unit` of its own, for example one that remembers its results.
     """
     (source, target), remarks = _without_wrong_normals(read_clouds(source, target))
     everywhere = isinstance(initial, str) and initial in ("global", "auto")
@@ -145,21 +149,23 @@ def planned(
 def _without_wrong_normals(
     clouds: tuple[PointCloud, PointCloud],
 ) -> tuple[tuple[PointCloud, PointCloud], tuple[str, ...]]:
-    """The clouds, without normals that contradict their points, and what is to be said of it."""
+    """The clouds, with normals removed where they contradict the points, and remarks that say
+    so."""
     kept, remarks = [], []
     for cloud, name in zip(clouds, ("source", "target"), strict=True):
         if cloud.normals is not None and plausible.contradict(cloud.points, cloud.normals):
             cloud = dataclasses.replace(cloud, normals=None)
             remarks.append(
                 f"the normals of the {name} contradict its points (placeholders, colors?): "
-                "estimated from the points instead"
+                "they were estimated from the points instead"
             )
         kept.append(cloud)
     return (kept[0], kept[1]), tuple(remarks)
 
 
 def _each_place_once(cloud: PointCloud) -> PointCloud:
-    """A cloud in which many points come again and again, with each of them once; else itself."""
+    """The cloud with each place kept once, if many of its points are repeated. Otherwise the cloud
+    itself."""
     rows = np.random.default_rng(0).permutation(len(cloud.points))[:_SAMPLED]
     if not units.repeated(cloud.points[rows]):
         return cloud
@@ -171,30 +177,32 @@ def _each_place_once(cloud: PointCloud) -> PointCloud:
 def _strays_in_words(frames: units.Frames, *clouds: PointCloud) -> tuple[str, ...]:
     return tuple(
         f"{count} of the {len(cloud.points)} points of the {name} lie far out and are not used: "
-        "more than four radii of the others"
+        "they are more than four radii from the center of the others"
         for count, cloud, name in zip(frames.strays, clouds, ("source", "target"), strict=True)
         if count
     )
 
 
 def whole_number(name: str, value: Any, *, least: int) -> int:
-    """`value` if it is a whole number of at least `least`; else a ValueError with the name."""
+    """Returns `value` as an int. Raises ValueError, with the argument's name, if it is not a whole
+    number of at least `least`."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise ValueError(f"{name}: got {value!r}, wanted a whole number of at least {least}")
     return int(value)
 
 
 def rigid_motions(initial: Any) -> Float[np.ndarray, "k 4 4"]:
-    """One or several initial motions, float64; raises ValueError for anything else."""
+    """Returns one or several initial motions as (k, 4, 4) in float64. Raises ValueError for
+    anything else."""
     try:
         given = np.asarray(initial)
-        if given.dtype.kind in "cOSUmM":  # numpy would make floats of complex numbers and texts
+        if given.dtype.kind in "cOSUmM":  # numpy would turn complex numbers and text into floats
             raise TypeError
         given = given.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
         what = repr(initial) if isinstance(initial, str) else f"a {type(initial).__name__}"
         raise ValueError(
-            f"initial: got {what} that is no array of numbers, "
+            f"initial: got {what}, which is not an array of numbers; "
             'wanted "global", "auto", a (4, 4) matrix, or several as (k, 4, 4)'
         ) from None
     if given.ndim not in (2, 3) or given.shape[-2:] != (4, 4) or not given.size:
