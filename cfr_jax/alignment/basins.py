@@ -1,9 +1,9 @@
-"""Whether another motion near an answer fits as well: what a nudge cannot tell.
+"""Finds out whether another motion near an answer fits as well, where a small nudge cannot tell.
 
-A nudge has the size of the inlier distance. Where clouds are sparse, it feels the samples and not
-the surface; where points lie near the axis of a turn, it hardly moves them. So the source is turned
-far from the answer and brought back by iterative closest points: a solid of revolution stays turned
-and fits as before.
+A nudge has about the size of the inlier distance. If the clouds are sparse, its effect depends on
+the samples and not on the surface. If the points lie near the axis of a turn, it hardly moves them.
+So the source is turned far away from the answer and brought back by iterative closest points. A
+solid of revolution stays turned and fits as well as before.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from cfr_jax.geometry import motions
 from cfr_jax.geometry.trees import Tree
 from cfr_jax.refine.generalized_icp import CUT
 
-# Of two samplings of eight solids of revolution, 500 to 1,000 points each, the best turned motion
-# fitted at least 0.97 times as well as the right one; of stacks of boxes at most 0.93 times. With
-# 120 points that does not tell them apart for certain, and with 60 not at all.
+# Measured on pairs of samplings of 500 to 1,000 points. For eight solids of revolution, the best
+# turned motion fitted at least 0.97 times as well as the right one; for stacks of boxes, at most
+# 0.93 times. With 120 points this does not separate them reliably, and with 60 not at all.
 RIVAL = 0.95
 _TURN = np.radians(30.0)  # as far as from the middle of the network's reach to its edge
-_APART = np.radians(10.0)
-_REACH = 1.5  # of a fit: this many times the spacing, so that sparse clouds still feel a surface
-_WIDEST = 0.3
+_APART = np.radians(10.0)  # motions whose rotations differ by more are different answers
+_REACH = 1.5  # the reach of a fit, in point spacings: sparse clouds still feel a surface
+_WIDEST = 0.3  # the first cut of iterative closest points, in units of the unit sphere
 _STEPS = 12
-_MOST = 512  # points of each cloud that are asked
-_FEWEST = 6  # pairs that a step takes
+_MOST = 512  # points of each cloud that are used
+_FEWEST = 6  # pairs that a step needs
 
-# Mean displacement, root of square, of an object's points by a turn of one radian or a slide of one
-# unit. Nudges that move less than this are too small for the inlier distance.
+# The root mean square displacement of an object's points under a turn of one radian or a slide of
+# one unit. Nudges that move the points less than this are too small for the inlier distance.
 _LEVER = 0.45
-_FARTHEST = 6.0  # a nudge is scaled up no more than this
-_SMALL, _LARGE = 0.06, 0.15  # nudges, as in `quality`
+_FARTHEST = 6.0  # the largest factor by which a nudge is scaled up
+_SMALL, _LARGE = 0.06, 0.15  # the sizes of nudges, as in `quality`
 _LEAST = 0.2  # as in `quality`
 
 Motion = Float[np.ndarray, "4 4"]
@@ -43,9 +43,11 @@ Motion = Float[np.ndarray, "4 4"]
 def free_turn(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"], transform: Motion
 ) -> Float[np.ndarray, " 6"] | None:
-    """The twist (rotation first, target's frame) to another motion that fits as well, if there is
-    one. Turns by 30 degrees about the principal axes of the source are tried. Both clouds lie in
-    the unit sphere; `transform` maps source onto target.
+    """The twist from `transform` to another motion that fits as well, or None if there is none.
+
+    The twist has its rotation first and is in the target's frame. Turns by 30 degrees about the
+    principal axes of the source are tried. Both clouds lie in the unit sphere; `transform` maps
+    source onto target.
     """
     source, target = (_fewer(cloud) for cloud in (source, target))
     trees = Tree(source), Tree(target)
@@ -70,8 +72,8 @@ def resistance(
     transform: Motion,
     twists: Float[np.ndarray, "w 6"],
 ) -> Float[np.ndarray, " w"]:
-    """`quality.measure`'s resistance along `twists`, with nudges that move the points of the source
-    as far as those of an object would move."""
+    """The resistance along `twists`, as `quality.measure` defines it, but with nudges that are
+    scaled up until they move the source's points as far as they would move those of an object."""
     tree, moved = Tree(target), motions.apply(transform, source)
 
     def lost(points: np.ndarray) -> float:
@@ -93,7 +95,7 @@ def resistance(
 
 
 def _nudged(points: np.ndarray, twist: np.ndarray) -> np.ndarray:
-    """Moved along a twist, up to the third order of its angle."""
+    """The points moved along a twist, exact up to the third order of its angle."""
     turn = motions.from_rotvec(twist[:3])
     half = motions.from_rotvec(twist[:3] / 2)
     return points @ turn.T + half @ twist[3:]
@@ -113,14 +115,16 @@ def _turned(source: np.ndarray, transform: Motion) -> Iterator[Motion]:
 
 
 def _mutual(source: Tree, target: Tree, reach: float, transform: Motion) -> float:
-    """Mean over both clouds of 1 - d^2 / reach^2, zero beyond."""
+    """The mean over both clouds of 1 - d^2 / reach^2, where d is the distance to the other cloud.
+    Points beyond the reach count as zero."""
     there = target.closest(motions.apply(transform, source.points))[1]
     back = source.closest(motions.apply(motions.inverse(transform), target.points))[1]
     return float(sum(np.mean(np.maximum(1 - (d / reach) ** 2, 0)) for d in (there, back)) / 2)
 
 
 def _settled(source: Tree, target: Tree, transform: Motion, reach: float) -> Motion:
-    """Where iterative closest points end, from pairs as far as `_WIDEST` down to those in reach."""
+    """The motion at which iterative closest points end. The cut on the distance of pairs shrinks
+    from `_WIDEST` to `reach`."""
     for cut in np.geomspace(max(_WIDEST, reach), reach, _STEPS):
         moved = motions.apply(transform, source.points)
         rows, away = target.closest(moved)

@@ -1,9 +1,9 @@
-"""The probability that an alignment is right, from the network's clues and from the surfaces.
+"""The probability that an alignment is right, from clues of the network and of the surfaces.
 
-Right means within 5 degrees and a tenth of the unit sphere's radius. The probability is a logistic
-regression on clues, whose coefficients come with the weights (`networks.probability`): they are
-fitted to validation pairs (`cfr calibrate`; docs/confidence.md shows how well that holds on other
-pairs). It is nearer the truth the closer one's own data are to those.
+Right means within 5 degrees and a tenth of the unit sphere's radius. The probability comes from a
+logistic regression on the clues. Its coefficients come with the weights (`networks.probability`)
+and are fitted to validation pairs (`cfr calibrate`). The more your data resemble those pairs, the
+better the probability holds; docs/confidence.md shows how well it holds on other pairs.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from cfr_jax.networks.probability import SURE, Calibration, logit
 
 @struct.dataclass
 class Clues:
-    """What also the surfaces tell of a refined answer."""
+    """The clues of a refined answer: the network's, and those that the surfaces add."""
 
     network: NetworkClues
     fitness: Float[Array, ""]
     distance: Float[Array, ""]
-    """Inlier RMSE, in unit spheres, times 20."""
+    """The inlier RMSE in units of the unit sphere, times 20."""
     agreement: Float[Array, ""]
-    """How far refinement turned the network's answer: log of degrees + 0.1."""
+    """How far refinement turned the network's answer: the log of (degrees + 0.1)."""
     resistance: Float[Array, ""]
-    """Square root of the weakest resistance to a nudge."""
+    """The square root of the weakest resistance to a nudge."""
 
 
 OF_NETWORK = tuple(field.name for field in dataclasses.fields(NetworkClues))
@@ -46,7 +46,8 @@ def gather(
     transform: Float[Array, "4 4"],
     quality: Quality,
 ) -> Clues:
-    """The clues of an answer `transform`, after a network that `found` another."""
+    """The clues of the answer `transform`, which refinement made from the motion that the network
+    `found`."""
     return Clues(
         network=network,
         fitness=quality.fitness,
@@ -57,14 +58,14 @@ def gather(
 
 
 def named(clues: Clues) -> dict[str, float]:
-    """All clues of one answer by name, as numbers of the host."""
+    """All clues of one answer, by name, as Python floats."""
     given = vars(clues.network) | {k: v for k, v in vars(clues).items() if k != "network"}
     return {name: float(value) for name, value in given.items()}
 
 
 def of_alignment(fitted: Calibration | None, clues: Mapping[str, float]) -> float | None:
-    """Probability in [0, 1] that an answer with these `Clues`, by name, is right; None without
-    calibration."""
+    """The probability, in [0, 1], that an answer with these clues (by name) is right. None without
+    a calibration."""
     if fitted is None:
         return None
     sure = logit(fitted.align, clues)

@@ -1,4 +1,4 @@
-"""The quality of motions on all points of the clouds, measured on the host by KD-trees."""
+"""The quality of motions on all points of the clouds, measured on the host with KD-trees."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from cfr_jax.geometry import motions
 from cfr_jax.refine import all_points
 from cfr_jax.refine.surfaces import HostSurface, closest
 
-_ASKED = 1 << 15  # points whose distances are enough to tell motions apart
-_SPACINGS = 2.0  # points of one surface are about half the spacing away from each other
+_ASKED = 1 << 15  # the distances of this many points are enough to tell motions apart
+_SPACINGS = 2.0  # points of aligned surfaces lie about half the spacing away from each other
 
 
 @struct.dataclass
 class Measured:
-    """The part of `quality.Quality` that can be told of millions of points in little time."""
+    """The part of `quality.Quality` that can be measured quickly on millions of points."""
 
     fitness: Float[np.ndarray, ""]
     inlier_rmse: Float[np.ndarray, ""]
@@ -27,8 +27,8 @@ class Measured:
 def measure(
     source: HostSurface, target: HostSurface, transform: Float[np.ndarray, "4 4"], distance: float
 ) -> Measured:
-    """Fitness, inlier error, overlap and moments of `transform` (source onto target), in float64,
-    as `quality.measure` defines them: points within `distance` are inliers."""
+    """The fitness, inlier error, overlap and moments of `transform` (source onto target), in
+    float64. They are defined as in `quality.measure`: points within `distance` are inliers."""
     rows, away = closest(source, target, transform)
     inlier = away <= distance
     near = away[inlier]
@@ -45,12 +45,13 @@ def measure(
 def misfit(
     source: HostSurface, target: HostSurface, transform: Float[np.ndarray, "4 4"], distance: float
 ) -> float:
-    """How badly two clouds lie on each other under `transform` (source onto target), in [0, 1].
+    """How badly two clouds fit under `transform` (source onto target), in [0, 1].
 
-    The mean of two losses: of the source's points to the target and of the target's points to the
-    source, each `all_points.score`, cut at twice the wider spacing of the two clouds, and at
-    `distance` at the most. One way alone, a small part lies well on any dense part of a large
-    cloud. Of clouds of more than `_ASKED` points only every second, third, ... one is asked.
+    It is the mean of two losses: from the source's points to the target, and from the target's
+    points to the source. Each is an `all_points.score`. Its cut is twice the wider of the two point
+    spacings, but at most `distance`. Both directions are needed because a small part fits well on
+    any dense part of a large cloud. If a cloud has more than `_ASKED` points, only every second,
+    third, ... point is used.
     """
     cut = min(distance, _SPACINGS * max(source.tree.spacing, target.tree.spacing))
     ways = (source, target, transform), (target, source, motions.inverse(transform))

@@ -1,4 +1,4 @@
-"""How good a registration is, and whether the clouds determine it at all, without the truth."""
+"""Measures, without the truth, how good a registration is and whether the clouds determine it."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from cfr_jax.refine.surfaces import Surface
 
 _HIGHEST = lax.Precision.HIGHEST
 _NUDGE = 0.15  # radians and units of the unit sphere; three times the usual inlier distance
-_TEXTURE = 0.06  # nudges as small as this feel the sampling: where the points lie on the surface
-_LEAST = 0.2  # where less of the fit is left to lose, a rise is chance
-_POINTWISE = 1e-3  # share of point-to-point information: settles what normals leave open
+_TEXTURE = 0.06  # nudges this small depend on the sampling: on where points lie on the surface
+_LEAST = 0.2  # if less of the fit than this is left to lose, a rise may be chance
+_POINTWISE = 1e-3  # share of point-to-point information, for directions that no normal resists
 _WEAKEST = 3  # a plane slides along two axes and turns about one; a ball turns about three
 
 
 @struct.dataclass
 class Quality:
-    """Measured in the unit sphere, under the answer's transform."""
+    """The quality of an answer, measured in the unit sphere under the answer's transform."""
 
     fitness: Float[Array, ""]
-    """Share of the source with a target point within the inlier distance."""
+    """The share of source points with a target point within the inlier distance."""
     inlier_rmse: Float[Array, ""]
-    """Root mean square distance of those; 0 where there are none."""
+    """The root mean square distance from those points to the target; 0 if there are none."""
     resistance: Float[Array, " w"]
-    """How much the fit suffers from a nudge along each of the weakest directions: about 0 not at
-    all (the clouds slide or turn freely), 1 all of it is lost."""
+    """How much the fit suffers from a nudge along each of the weakest directions. About 0 means not
+    at all (the clouds slide or turn freely); 1 means that the whole fit is lost."""
     weakest: Float[Array, "w 6"]
-    """Those directions: twists in the target's frame, rotation first, of unit length."""
+    """The weakest directions: twists in the target's frame, rotation first, of unit length."""
     overlap: Float[Array, ""]
-    """Share of the source that the target seems to have seen, too."""
+    """The estimated share of the source that the target shows, too."""
     moments: Float[Array, "4 4"]
-    """Sum of [y; 1][y; 1]' over the target points that lie closest to the inliers."""
+    """The sum of [y; 1][y; 1]' over the target points that lie closest to the inliers."""
 
 
 def measure(
@@ -48,20 +48,22 @@ def measure(
     distance: float,
     spacing: Float[Array, ""],
 ) -> Quality:
-    """Fitness, inlier error, overlap and determinedness of `transform` (source onto target).
+    """Measures fitness, inlier error, overlap and resistance of `transform` (source onto target).
 
     The overlap counts the points of the source with a target point closer than twice the target's
-    `spacing`: on 78 partial, noisy validation pairs under the truth that was 0.02 off the true
-    overlap in the mean, and no more than 0.006 too high.
+    `spacing`. On 78 partial, noisy validation pairs under the truth, this was off the true overlap
+    by 0.02 on average, and at most 0.006 too high.
 
     The weakest directions are the eigenvectors with the smallest eigenvalues of the point-to-plane
-    information matrix (geometric stability: Gelfand et al., 2003), to which a little point-to-point
-    information is added: of directions that no normal resists, those that move the fewest points
-    come first (a line turns about itself before it slides). Noise in the normals hides a free
-    direction from its eigenvalue, so each is tried: the source is nudged both ways along it, and
-    the rise of the truncated score is compared with all it could rise. It is measured from a small
-    nudge on, not from rest: leaving the place where the samples happen to meet costs something on
-    any surface.
+    information matrix (geometric stability: Gelfand et al., 2003). A little point-to-point
+    information is added to this matrix. So among the directions that no normal resists, those that
+    move the points least come first (a line turns about itself before it slides).
+
+    Noise in the normals keeps the eigenvalue of a free direction from being small, so each
+    direction is also tried: the source is nudged both ways along it, and the rise of the truncated
+    score is compared with the largest rise possible. The rise is measured from a small nudge and
+    not from rest, because on any surface it costs something to leave the place where the samples
+    happen to meet.
     """
     moved = rigid.apply(transform, source.points)
     found = closest(moved, target.points, target.mask)
@@ -101,7 +103,7 @@ def measure(
 def spacing(
     points: Float[Array, "m 3"], neighbors: Int[Array, "m k"], mask: Bool[Array, " m"]
 ) -> Float[Array, ""]:
-    """Median distance of a point to the nearest of its neighbors."""
+    """The median distance from a point to its nearest neighbor."""
     offset = points[neighbors] - points[:, None]
     nearest = jnp.sqrt(jnp.min(jnp.sum(offset * offset, axis=2), axis=1))
     return jnp.nanmedian(jnp.where(mask, nearest, jnp.nan))
@@ -112,9 +114,9 @@ def information_matrix(
 ) -> Float[np.ndarray, "6 6"]:
     """Open3D's information matrix of the inliers, for a target y = center + scale * unit; float64.
 
-    Sum of J'J over the target's points, J how a twist (rotation first, then translation) moves one,
-    as Choi, Zhou & Koltun (2015) use it in pose graphs. It follows from the `moments` of the unit
-    cloud, so that no point is looked at again.
+    It is the sum of J'J over the target points. J, the Jacobian of a point, says how a twist
+    (rotation first, then translation) moves it. Choi, Zhou & Koltun (2015) use this matrix in pose
+    graphs. It is computed from the `moments` of the unit cloud alone, without the points.
     """
     to_caller = np.diag([scale, scale, scale, 1.0])
     to_caller[:3, 3] = center
@@ -128,12 +130,12 @@ def information_matrix(
 def mutual_fit(
     source: Surface, target: Surface, transform: Float[Array, "4 4"], reach: float
 ) -> Float[Array, ""]:
-    """How well two clouds lie on each other under `transform` (source onto target), in [0, 1].
+    """How well two clouds fit under `transform` (source onto target), in [0, 1].
 
-    The mean over both clouds of 1 - d^2 / reach^2 (Epanechnikov; zero beyond `reach`), d the
-    distance to the closest point of the other cloud, times the cosine between the two normals (zero
-    where they oppose). Unlike the fitness it sees when a small part lies on a large one anywhere,
-    or when a thin shape is turned over.
+    It is the mean over the points of both clouds of 1 - d^2 / reach^2 (Epanechnikov's kernel; zero
+    beyond `reach`) times the cosine between the two normals (zero if they are opposed). Here d is
+    the distance to the closest point of the other cloud. Unlike the fitness, this score falls when
+    a small part lies in the wrong place on a large one, or when a thin shape is turned over.
     """
 
     def covered(first: Surface, second: Surface, motion: Array) -> Array:
@@ -149,7 +151,7 @@ def mutual_fit(
 
 
 def _truncated(source: Surface, target: Surface, transforms: Array, distance: float) -> Array:
-    """Mean over the source of the squared distance to the target, truncated, under each of the
+    """The mean over the source of the truncated squared distance to the target, under each of the
     `transforms`; in [0, 1]."""
     square = squared_distances(source, target, transforms)
     truncated = jnp.minimum(square / distance**2, 1)
@@ -158,7 +160,8 @@ def _truncated(source: Surface, target: Surface, transforms: Array, distance: fl
 
 
 def _pointwise_information(points: Array, weights: Array) -> Array:
-    """Sum of J'J, J how a twist (turn, slide) moves a point: turn x p + slide."""
+    """The sum of J'J, where J is the Jacobian of a point under a twist (turn, slide), which moves
+    the point p by turn x p + slide."""
     turn = -jax.vmap(rigid.skew)(points)
     slide = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), turn.shape)
     jacobian = jnp.concatenate([turn, slide], axis=2) * weights[:, None, None]
