@@ -1,8 +1,8 @@
-"""Registration from anywhere: many starts on coarse clouds, the best few refined on full ones.
+"""Registration from anywhere: tries many starts on coarse clouds, refines the best on full ones.
 
-The network finds motions of up to about 45 degrees about each axis. So it is started from rotations
-that cover all of SO(3), on clouds thinned so far that all starts together cost little; where each
-of them ended is told by how well the clouds then lie on each other, never by the network itself.
+The network finds rotations of up to about 45 degrees about each axis. So it is started from
+rotations that cover all of SO(3), on clouds that are thinned until all starts together cost little.
+The results are ranked by how well the clouds then fit, never by the network itself.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from cfr_jax.runtime import programs
 COARSE = Settings(neighbors=24)
 COARSE_POINTS = 256
 KEPT = 4
-_AT_ONCE = 32  # starts vectorized together by accelerators; one by one they stay in a CPU's caches
-# Two answers closer than this are one: they end in one place when refined.
+_AT_ONCE = 32  # starts that accelerators vectorize together; one at a time fits a CPU's caches
+# Two answers closer than this count as one, because refinement takes both to the same place.
 _SAME_TURN = 20.0  # degrees
-_SAME_PLACE = 0.2
-RIVAL = 0.95  # of the best fit: so near, the shapes alone do not say which is right
-_FEW = 8  # starts that are refined in full
+_SAME_PLACE = 0.2  # units of the unit sphere
+RIVAL = 0.95  # share of the best fit from which on the shapes alone do not say which one is right
+_FEW = 8  # up to this many given starts are all refined on the full clouds, too
 _COARSE_REACH = 0.1
 _FULL_REACH = generalized_icp.CUT
 
 
 @struct.dataclass
 class Candidates:
-    """Motions of the source onto the target, and how well each fits."""
+    """Motions of the source onto the target, and how well each one fits."""
 
     motions: Float[Array, "k 4 4"]
     fits: Float[Array, " k"]
@@ -64,11 +64,12 @@ def propose(
     at_once: int = 1,
     as_given: bool = False,
 ) -> Candidates:
-    """Where the network ends on coarse clouds from each start: the `kept` that fit best and differ.
+    """Runs the network from each start on coarse clouds, and returns the `kept` best motions that
+    differ from each other.
 
-    `at_once` starts go through the network together (`vmap`); the target is encoded once. Where
-    starts are to be respected `as_given`, each is also refined without the network. Where fewer
-    than `kept` differ, the rest have a fit of -1.
+    `at_once` starts go through the network together (`vmap`); the target is encoded once. With
+    `as_given`, each start is also refined without the network. If fewer than `kept` motions differ,
+    the remaining rows have a fit of -1.
     """
     sides = source.prepared(COARSE), target.prepared(COARSE)
     encoded = encode(params, sides[1], settings=COARSE)
@@ -88,7 +89,7 @@ def propose(
 
 @jax.jit
 def polish(source: DeviceCloud, target: DeviceCloud, found: Float[Array, "k 4 4"]) -> Candidates:
-    """Refines each motion on the full clouds, and tells how well it fits."""
+    """Refines each motion on the full clouds, and measures how well it then fits."""
     first, second = (surface(cloud.prepared(planning.SETTINGS)) for cloud in (source, target))
 
     def refine(motion: Array) -> tuple[Array, Array]:
@@ -99,7 +100,7 @@ def polish(source: DeviceCloud, target: DeviceCloud, found: Float[Array, "k 4 4"
 
 
 def search(case: Case) -> Case:
-    """The plan started where its source comes to lie best on its target, of all starts given."""
+    """Tries all starts of the plan, and moves the source to the one that fits best."""
     assert case.plan.starts is not None
     starts = case.plan.starts
     few = starts if len(starts) <= _FEW else None
@@ -107,7 +108,7 @@ def search(case: Case) -> Case:
 
 
 def started(case: Case) -> Case:
-    """The case at the best motion that was just `tried`."""
+    """The case with its source moved by the best motion that `tried` found."""
     assert case.searched is not None
     plan = case.plan.started_at(case.searched.unit_motions[0])
     return dataclasses.replace(case, plan=plan)
@@ -121,11 +122,12 @@ def tried(
     nearby: bool = False,
     as_given: bool = False,
 ) -> Case:
-    """The case with what was `searched`: the best motions of its source onto its target, from all
-    `starts` of unit clouds.
+    """The case with the result of a search in `searched`: the best motions of its source onto its
+    target, found from all `starts`, which are motions between the unit clouds.
 
-    Motions `beside` them are refined without the network. `as_given` says that the starts are to be
-    respected, too. What is best is told by the misfit on all points (`measuring.misfit`).
+    The motions in `beside` are refined as well, but without the network. With `as_given`, the
+    starts are also refined without the network. The motions are ranked by their misfit on all
+    points (`measuring.misfit`). `nearby` says that all starts lie around the source's own position.
     """
     plan = case.plan
     at_once = _AT_ONCE if on_accelerator() else 1
@@ -169,7 +171,7 @@ def tried(
 
 
 def rivals(searched: Search, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "a 4 4"]:
-    """Motions that differ from `transform` and fit about as well as the best."""
+    """The motions that differ from `transform` and fit about as well as the best one."""
     frames, fits = searched.frames, searched.fits
     unit, mine = frames.to_unit(searched.motions), frames.to_unit(transform)
     near = np.array([_near(mine, other) for other in unit])
@@ -183,13 +185,14 @@ def same(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Array:
 
 
 def _near(first: np.ndarray, second: np.ndarray) -> bool:
-    """`same`, on the host."""
+    """Does what `same` does, on the host."""
     away = np.linalg.norm(first[:3, 3] - second[:3, 3])
     return bool(angle_between(first, second) < _SAME_TURN and away < _SAME_PLACE)
 
 
 def _distinct(motions: Array, fits: Array, kept: int) -> Candidates:
-    """The best fit, then the best of those that differ from it, and so on."""
+    """The `kept` best motions that differ: the best fit, then the best of those that differ from
+    it, and so on."""
 
     def take(fits: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
         best = jnp.argmax(fits)

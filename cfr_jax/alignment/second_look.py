@@ -1,11 +1,11 @@
-"""Other starts than the one where the source lies: where an answer is in doubt, and a start given.
+"""Tries further starts if an answer is in doubt, and compares the network's answer with its start.
 
-Most pairs are answered right from where they lie, and most of the others show it in the confidence.
-From a few other starts, tried on thinned clouds, the network then often finds what it missed: time
-is spent where it is needed.
+For most pairs, the answer from where the clouds lie is right. Most wrong answers have a low
+confidence. For those, the network often finds the right motion from one of a few other starts,
+which are tried on thinned clouds. So extra time is spent only on the pairs that need it.
 
-The network also moves on from a start that was right. So a start that somebody gave, or that a
-search found, is refined beside what the network found from it, and the better one is the answer.
+The network may also move away from a start that was right. So a start that the caller gave or that
+a search found is refined without the network, too, and the better of the two motions is the answer.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ from cfr_jax.refine import Refinement
 
 Step: TypeAlias = Callable[[Case], Case]
 
-# Of 153 pairs (val.h5, and rooms of the frames for choices), 25 were right by only one of the plain
-# answer and that of a search; this took the right one 24 times. So does anything up to 0.98.
+# For 25 of 153 pairs (val.h5, and rooms from the frames used to make choices), only one of the two
+# answers was right: the one with a search, or the one without. This factor chose the right answer
+# 24 times, and so does any other up to 0.98.
 _CLEARLY = 0.95
 
 
 def look_again(case: Case, *, refine: Refinement | None) -> Case:
-    """The case as it is, or solved from another start where that is more likely to be right.
+    """Solves a doubtful case from another start. Returns whichever case is more likely right.
 
-    Starts are `starts.around` the first and the clouds as they lie in their frames. Nothing is
-    tried where the answer is trusted, where somebody said where the source starts, or where weights
-    without calibration leave open which answer is more likely right.
+    The starts are those of `starts.around`, and the clouds as they lie in their frames. Nothing is
+    tried if the answer is trusted, if the caller or a search chose the start, or if the weights
+    have no calibration, because then nothing says which answer is more likely right.
     """
     first = _confidence(case)
     if case.plan.start_given or first is None or first >= doubts.TRUSTED:
@@ -53,9 +54,10 @@ def look_again(case: Case, *, refine: Refinement | None) -> Case:
 def look_everywhere(
     case: Case, *, plan: Plan, refine: Refinement | None, finish: Sequence[Step]
 ) -> Case:
-    """The case finished, or solved from one of all `plan.starts` where that is clearly better.
+    """Searches from all `plan.starts`. Returns the case that the search found, if it is clearly
+    better, and otherwise the case without a search. Either one is finished.
 
-    The answer so far always takes part (`clearly_better`). It stands unasked where it is
+    The answer so far is always compared (`clearly_better`). There is no search if this answer is
     trusted and the plan wants a search only `if_doubted`.
     """
     plain = finished(case, finish)
@@ -75,12 +77,12 @@ def look_everywhere(
 
 
 def keep_start(case: Case, *, refine: Refinement | None, finish: Sequence[Step]) -> Case:
-    """The case finished, from what the network found or from where the source started.
+    """The finished case with the best of three motions: the network's, or one from the start.
 
-    Candidates are the network's answer, the start after `refine` (if JAX can trace it), and the
-    start as it is. Each goes through the steps of `finish`; the one with the smallest
-    `measuring.misfit` is the answer. If that is not the network's, what is told of it is measured
-    anew.
+    The candidates are the network's answer, the start as it is, and the start after `refine` (if
+    JAX can trace it). Each goes through the steps of `finish`, and the one with the smallest
+    `measuring.misfit` is the answer. If it is not the network's, its quality and clues are measured
+    again.
     """
     placed_at = [np.eye(4, dtype=np.float32)]
     sides = solving.on_device(case.plan.source, case.plan.target)
@@ -103,14 +105,14 @@ def keep_start(case: Case, *, refine: Refinement | None, finish: Sequence[Step])
 def refined_start(
     source: solving.DeviceCloud, target: solving.DeviceCloud, *, refine: Refinement
 ) -> Float[Array, "4 4"]:
-    """Where a refinement that JAX can trace ends from where the source lies."""
+    """The motion that a refinement which JAX can trace finds from where the source lies."""
     first, second = (solving.surface(cloud.prepared()) for cloud in (source, target))
     return jnp.asarray(refine(first, second, jnp.eye(4)).transform)
 
 
 def clearly_better(other: Case, case: Case) -> bool:
-    """Whether the answer of `other`, from another start, has a misfit so much smaller than that of
-    `case` that this cannot be chance."""
+    """Whether the misfit of `other`, which was solved from another start, is so much smaller than
+    that of `case` that the difference cannot be chance."""
     return refining.misfit(other) < _CLEARLY * refining.misfit(case)
 
 
