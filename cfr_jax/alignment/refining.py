@@ -1,4 +1,4 @@
-"""Refinements on the host: what they get of a case, and what becomes of their answer."""
+"""Runs refinements on the host: gives them the clouds of a case and puts their answer into it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from cfr_jax.refine.surfaces import HostSurface
 
 
 def refine_used_points(case: Case, *, refine: Refinement) -> Case:
-    """The case refined on the points that the network saw, unless the result fits worse."""
+    """Refines the case on the points that the network saw. The result is kept unless it fits
+    worse."""
     began = time.perf_counter()
     plan, found = case.plan, case.solved()
     surfaces = _used(plan.source), _used(plan.target)
@@ -35,10 +36,10 @@ def refine_used_points(case: Case, *, refine: Refinement) -> Case:
 
 
 def refine_every_point(case: Case, *, refine: Refinement) -> Case:
-    """The case refined on all points of the caller's clouds, and measured on all of them.
+    """Refines the case on all points of the caller's clouds, and measures its quality on them.
 
-    What the confidence and the free directions are told from stays as it was on the points that
-    the network saw: it depends on how dense a cloud is.
+    The clues of the confidence and the free directions are not measured again. They keep their
+    values from the points that the network saw, because they depend on the density of a cloud.
     """
     began = time.perf_counter()
     case = placed(case)
@@ -58,7 +59,7 @@ def refine_every_point(case: Case, *, refine: Refinement) -> Case:
 
 
 def measured(case: Case) -> Case:
-    """The case with the quality of its motion on the clouds that are `placed`."""
+    """The case with the quality of its motion measured on the `placed` clouds."""
     found = case.solved()
     transform = to_placed(case, np.asarray(found.transform))
     told = measuring.measure(*surfaces(case), transform, solving.DISTANCE)
@@ -67,15 +68,16 @@ def measured(case: Case) -> Case:
 
 
 def misfit(case: Case, transform: Float[np.ndarray, "4 4"] | None = None) -> float:
-    """`measuring.misfit` of the answer of a `placed` case, or of another motion of its unit
-    clouds."""
+    """The `measuring.misfit` of a `placed` case's answer, or of another motion `transform` between
+    its unit clouds."""
     if transform is None:
         transform = np.asarray(case.solved().transform)
     return measuring.misfit(*surfaces(case), to_placed(case, transform), solving.DISTANCE)
 
 
 def placed(case: Case) -> Case:
-    """The case with its clouds on the host: made once, and kept for other starts of this pair."""
+    """The case with its clouds on the host. They are made once and kept for other starts of this
+    pair."""
     if case.placed is not None:
         return case
     plan = case.plan
@@ -84,13 +86,13 @@ def placed(case: Case) -> Case:
 
 
 def surfaces(case: Case) -> tuple[HostSurface, HostSurface]:
-    """Source and target of a `placed` case."""
+    """The source and the target of a `placed` case."""
     assert case.placed is not None
     return case.placed.source, case.placed.target
 
 
 def to_placed(case: Case, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """A motion between the plan's unit clouds as one between the clouds that are `placed`."""
+    """Converts a motion between the plan's unit clouds to one between the `placed` clouds."""
     assert case.placed is not None
     transform = np.asarray(transform, np.float64)
     if case.placed.frames is case.plan.frames:
@@ -99,7 +101,7 @@ def to_placed(case: Case, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarr
 
 
 def _of_plan(case: Case, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """A motion between the clouds that are `placed` as one of the plan's unit clouds."""
+    """Converts a motion between the `placed` clouds to one between the plan's unit clouds."""
     assert case.placed is not None
     if case.placed.frames is case.plan.frames:
         return transform
@@ -112,7 +114,7 @@ def _used(unit: UnitCloud) -> HostSurface:
 
 
 def every_point(plan: Plan) -> tuple[HostSurface, HostSurface]:
-    """All points of both clouds, where the unit clouds of the plan lie."""
+    """All points of both clouds, in the same frames as the plan's unit clouds."""
     assert plan.whole is not None, "planned with `whole`"
     frames = plan.frames
     sides = (

@@ -1,6 +1,6 @@
-"""What `align` runs on the device: the network, the refinement, and what their answer is worth.
+"""The part of `align` that runs on the device: the network, the refinement, and the quality.
 
-Pure functions of one pair of unit clouds; batches are `vmap`.
+The numerical functions are pure and take one pair of unit clouds. Batches use `vmap`.
 """
 
 from __future__ import annotations
@@ -37,15 +37,16 @@ DISTANCE = generalized_icp.CUT
 
 @struct.dataclass
 class DeviceCloud:
-    """A unit cloud on the device, with neighbors, and with normals if the caller gave some."""
+    """A unit cloud on the device."""
 
     points: Float[Array, "*batch n c"]
+    """Points, followed by normals in the last three columns if the caller gave some."""
     neighbors: Int[Array, "*batch n k"] | None
-    """None where the device is to find them."""
+    """The rows of each point's neighbors; None if the device has to find them."""
     mask: Bool[Array, "*batch n"]
 
     def prepared(self, settings: Settings = SETTINGS) -> Cloud:
-        """As the network takes it."""
+        """The cloud in the form that the network takes."""
         return prepare(self.points, neighbors=self.neighbors, mask=self.mask, settings=settings)
 
 
@@ -63,10 +64,11 @@ programs.storable_static(Calibration, Calibration.write, Calibration.read)
 
 
 def solve(params: Params, source: Cloud, target: Encoded, *, refine: Refinement | None) -> Found:
-    """The device's part for one pair of unit clouds: registered, refined, judged.
+    """Registers and refines one pair of unit clouds and measures the quality of the answer.
 
-    Refining never answers worse, by its own score, than the network did or than the source lay
-    when it came: a start that fits better than all that was found from it stands.
+    With `refine`, the answer never scores worse, by the refinement's own score, than the network's
+    answer or than the source's original position. If that position fits better than everything
+    found from it, it is the answer.
     """
     registration = register(params, source, target, cascades=CASCADES, settings=SETTINGS)
     surfaces = surface(source), surface(target.cloud)
@@ -94,7 +96,8 @@ def replaced(
     converged: Bool[Array, ""],
     steps: Int[Array, ""],
 ) -> Found:
-    """`found` with another refinement's `transform` instead, unless that fits worse."""
+    """Replaces the motion in `found` with the `transform` of another refinement, unless that fits
+    worse."""
     cloud = target.prepared()
     surfaces = surface(source.prepared()), surface(cloud)
     before, after = scores(*surfaces, jnp.stack([found.transform, transform]), DISTANCE)
@@ -106,7 +109,7 @@ def replaced(
 
 @jax.jit
 def judged(source: DeviceCloud, target: DeviceCloud, found: Found) -> Found:
-    """`found` with the quality and the clues of its transform, which somebody put there."""
+    """Measures the quality and the clues in `found` again, for a transform that was replaced."""
     cloud = target.prepared()
     surfaces = surface(source.prepared()), surface(cloud)
     measured, clues = _judge(found.registration, jnp.asarray(found.transform), cloud, surfaces)
@@ -124,23 +127,23 @@ def _judge(
 
 
 def surface(cloud: Cloud) -> Surface:
-    """A prepared cloud as the refinement sees it."""
+    """The surface that a refinement gets for a prepared cloud."""
     mask = jnp.ones(cloud.points.shape[0], bool) if cloud.mask is None else cloud.mask
     return Surface(cloud.points, cloud.normals, mask)
 
 
 def on_accelerator() -> bool:
-    """Whether programs run on anything but a CPU."""
+    """Whether programs run on something other than a CPU."""
     return jax.default_backend() != "cpu"
 
 
 def on_device(*clouds: UnitCloud) -> tuple[DeviceCloud, ...]:
-    """Unit clouds, all sent to the device at once."""
+    """Sends unit clouds to the device, all in one transfer."""
     rows = [
         unit.points if unit.normals is None else np.hstack([unit.points, unit.normals])
         for unit in clouds
     ]
-    # not jnp.asarray, which compiles a copy of each shape
+    # jnp.asarray would compile a copy program for each shape
     sent = jax.device_put([(r, c.neighbors, c.mask) for r, c in zip(rows, clouds, strict=True)])
     return tuple(DeviceCloud(*parts) for parts in sent)
 
@@ -149,16 +152,16 @@ def on_device(*clouds: UnitCloud) -> tuple[DeviceCloud, ...]:
 def solve_pair(
     params: Params, source: DeviceCloud, target: DeviceCloud, *, refine: Refinement | None
 ) -> Found:
-    """`solve` for two clouds as `on_device` hands them over."""
+    """Runs `solve` on two clouds that `on_device` returned."""
     encoded = encode(params, target.prepared(), settings=SETTINGS)
     return solve(params, source.prepared(), encoded, refine=refine)
 
 
 def solve_case(case: Case, *, refine: Refinement | None) -> Case:
-    """The case with what the network finds for its plan, refined by what JAX can trace.
+    """The case with the network's answer for its plan, after the refinement that JAX can trace.
 
-    What is found comes back to the host in one transfer: on an accelerator each costs as much as
-    a few kernels.
+    The results come back to the host in one transfer, because on an accelerator each transfer costs
+    as much as a few kernels.
     """
     sides = on_device(case.plan.source, case.plan.target)
     found = timed(case.seconds, solve_pair, case.params, *sides, refine=refine)
@@ -166,8 +169,8 @@ def solve_case(case: Case, *, refine: Refinement | None) -> Case:
 
 
 def timed(seconds: dict[str, float], function: Callable, *arguments: Any, **static: Any) -> Any:
-    """What a jitted function answers, when it is there; adds the time to the `seconds` of "compile"
-    and of "run"."""
+    """Calls a jitted function, waits for its result and returns it. Adds the time to "compile" and
+    "run" in `seconds`."""
     began = time.perf_counter()
     program = programs.compiled(function, *arguments, **static)
     ready = time.perf_counter()
