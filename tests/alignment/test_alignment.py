@@ -1,6 +1,7 @@
-"""`align` end to end, with the weights that ship: what it finds, and what changes nothing.
+"""`align` end to end with the shipped weights: the motions it finds, and changes of the input that
+do not change the answer.
 
-Nearly all clouds here have 417 to 512 points, so that one compiled program serves them.
+Nearly all clouds here have 417 to 512 points, so they share one compiled program.
 """
 
 import dataclasses
@@ -26,7 +27,7 @@ TRUTH = solids.motion(25)
 
 @pytest.fixture(scope="module")
 def pair():
-    """Two noisy samplings of one shape, the target moved by TRUTH."""
+    """Two noisy samplings of one shape, with the target moved by TRUTH."""
     return solids.two_samplings(500, TRUTH)
 
 
@@ -36,7 +37,7 @@ def answer(pair):
 
 
 def off_at(first, second, points):
-    """How far two motions carry the centroid of `points` apart."""
+    """The distance between the places to which two motions carry the centroid of `points`."""
     center = points.mean(axis=0)
     return np.linalg.norm(solids.move(first, center) - solids.move(second, center))
 
@@ -135,7 +136,7 @@ def test_the_answer_moves_along_with_the_target(pair, answer):
 
 @pytest.mark.parametrize("which", [0, 1])
 def test_the_order_of_the_points_changes_nothing(pair, answer, which):
-    # all points are used: of a larger cloud another order lets other points be drawn
+    # small enough to use all points; in a larger cloud, another order changes which are drawn
     order = np.random.default_rng(0).permutation(500)
     clouds = list(pair)
     clouds[which] = clouds[which][order]

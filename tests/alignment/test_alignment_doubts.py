@@ -1,4 +1,4 @@
-"""What `align` finds but does not trust: shapes that move freely, different things, few points."""
+"""Answers that `align` does not trust: shapes that move freely, different things, few points."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ TRUTH = solids.motion(25)
 
 @pytest.fixture(scope="module")
 def pair():
-    """Two noisy samplings of one shape, the target moved by TRUTH."""
+    """Two noisy samplings of one shape, with the target moved by TRUTH."""
     return solids.two_samplings(500, TRUTH)
 
 
@@ -45,7 +45,7 @@ def test_a_shape_that_moves_freely_is_not_trusted_and_the_axis_named(shape, nois
     assert all(abs(axis[place]) < 0.2 for place in held[verb])
 
 
-# Not so of a sphere: with 500 points on it the samples themselves hold the motion, and it is right.
+# Spheres are left out: the 500 samples themselves determine the motion, and the answer is right.
 @pytest.mark.parametrize("shape", ["plane", "cylinder", "line"])
 def test_the_same_samples_of_a_free_shape_are_not_trusted_either(shape):
     points = FREE[shape][0](500, 0).points

@@ -1,4 +1,4 @@
-"""What `align` refuses, always by the name of the argument."""
+"""Input that `align` rejects, always with the name of the argument."""
 
 import numpy as np
 import pytest

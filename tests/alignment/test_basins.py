@@ -1,4 +1,4 @@
-"""Turned far and brought back: what stays turned and fits as well is free."""
+"""A source is turned far and brought back. If it stays turned and fits as well, it turns freely."""
 
 import hard_cases
 import numpy as np
@@ -60,13 +60,13 @@ def test_closest_points_bring_a_turned_shape_back():
 
 
 def test_what_lies_near_the_axis_is_nudged_as_far_as_what_lies_off_it():
-    # given a long, thin bar, turned about its length: points move a tenth of the turn
+    # given a long, thin bar: under a turn about its length, points move by a tenth of the angle
     source, target = (RNG.uniform(-1, 1, (800, 3)) * [1.0, 0.12, 0.06] for _ in range(2))
     about, along = np.eye(6)[0], np.eye(6)[3]
 
     found = basins.resistance(source, target, np.eye(4), np.stack([about, along]))
 
-    # then it holds about as well as against sliding, although usual nudges would stay inliers
+    # then the turn is resisted, although points nudged by the usual size would stay inliers
     assert found[0] > doubts.FREE
 
 

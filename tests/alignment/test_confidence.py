@@ -1,4 +1,4 @@
-"""The clues of an answer, and the probabilities made of them."""
+"""The clues of an answer, and the probabilities computed from them."""
 
 import dataclasses
 
@@ -30,8 +30,8 @@ def clues(**changes):
 
 
 def seen(degrees, *, shrunk=1.0, off=0.0, weights=None, mask=None):
-    """Clues of a registration whose iterations are turned by `degrees`, and whose match puts the
-    points where the last says, but `shrunk` about their center and `off`."""
+    """The clues of a registration whose iterations are turned by `degrees`. Its matches lie where
+    the last iteration puts the points, but `shrunk` about their center and shifted by `off`."""
     transforms = np.stack([solids.motion(angle) for angle in degrees])
     weights = np.full(len(POINTS), 0.5) if weights is None else weights
     center = np.average(POINTS, axis=0, weights=weights)

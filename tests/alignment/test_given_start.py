@@ -1,4 +1,4 @@
-"""A given start is refined beside what the network finds from it, and the better is kept."""
+"""A given start is also refined without the network, and the better of the two answers is kept."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from cfr_jax.batch.stream import align_many
 from cfr_jax.refine.surfaces import HostSurface
 
 TRUTH = solids.motion(4, (0, 0, 1), (0.8, 0.1, 0))
-# x, y of the center, and the size of boxes on the ground
+# boxes on the ground: x and y of the center, and the size
 _BOXES = (
     ((8, 3), (4, 2, 1.5)),
     ((-10, 4), (4, 2, 1.5)),
@@ -23,8 +23,8 @@ _LOW = -1.7
 
 
 def street(seed):
-    """Ground, two walls and some boxes, in meters: dense near a scanner at the origin, which sees
-    30 m far."""
+    """Ground, two walls and some boxes, in meters. The points are dense near a scanner at the
+    origin, which sees up to 30 m."""
     rng = np.random.default_rng(seed)
     count = 600
     away = np.exp(rng.uniform(np.log(2), np.log(30), 2 * count))
@@ -49,7 +49,8 @@ def some(points, count=500):
 
 
 def quarter_seen(at):
-    """A scan of which the source saw a quarter, about the direction `at` in degrees."""
+    """A pair whose source shows only a quarter of the street, around the direction `at`, in
+    degrees."""
     source, target = street(1), street(2)
     angle = np.degrees(np.arctan2(source[:, 1], source[:, 0]))
     inside = np.abs((angle - at + 180) % 360 - 180) <= 45
@@ -57,14 +58,14 @@ def quarter_seen(at):
 
 
 def off(transform, source):
-    """Degrees, and meters on the average point."""
+    """The error of a motion: degrees, and meters as the mean over the points."""
     moved = solids.move(transform, source) - solids.move(TRUTH, source)
     return solids.degrees_between(transform, TRUTH), np.linalg.norm(moved, axis=1).mean()
 
 
 @pytest.fixture(scope="module")
 def kept():
-    """A pair that the network leaves from the truth (it slides 9 m along the street)."""
+    """A pair on which the network moves away from the truth (it slides 9 m along the street)."""
     pair = quarter_seen(0)
     return pair, align(*pair, initial=TRUTH)
 

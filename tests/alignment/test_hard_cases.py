@@ -1,4 +1,4 @@
-"""How often an answer to a hard pair is wrong and trusted, or right and doubted."""
+"""How often the answer for a hard pair is wrong but trusted, or right but doubted."""
 
 import hard_cases
 import pytest
@@ -14,7 +14,7 @@ def counted(kinds, count, seed):
     return counts
 
 
-# Sizes that share two compiled programs. The seeds are not those that thresholds were chosen with.
+# These sizes share two compiled programs. The thresholds were chosen with other seeds.
 @pytest.mark.parametrize("kind", ["wrong normals", "strays", "duplicates"])
 def test_what_spoils_a_cloud_neither_fools_nor_frightens(kind):
     counts = counted((kind,), 4, seed=11)

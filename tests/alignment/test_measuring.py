@@ -1,4 +1,4 @@
-"""What `align` does on all points by default, and what it then reports, by oracles."""
+"""What `align` does on all points by default, and whether oracles confirm what it reports."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ CENTER = np.array([300.0, -20.0, 5.0])
 
 @pytest.fixture(scope="module")
 def pair():
-    """More points than the network sees here, far from the origin."""
+    """Clouds far from the origin, with more points than the network sees in these tests."""
     source, target = (solids.lopsided(3000, seed, 0.003).points for seed in (0, 1))
     return source, solids.move(TRUTH, target) + CENTER
 
@@ -36,7 +36,7 @@ def thinned(pair):
 
 
 def off(transform, points):
-    """The mean distance of the points from where they belong."""
+    """The mean distance of the moved points from their true places."""
     away = solids.move(transform, points) - solids.move(WANTED, points)
     return np.linalg.norm(away, axis=1).mean()
 

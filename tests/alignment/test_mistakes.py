@@ -1,4 +1,4 @@
-"""What people get wrong, and what they are told: at most three lines, which name the way out."""
+"""Common mistakes and their messages: at most three lines, which say how to fix the mistake."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from cfr_jax.cli.shared import outputs
 RNG = np.random.default_rng(0)
 SCALED = np.diag([2.0, 2.0, 2.0, 1.0])
 
-# Words of the command line, and what the message has to say. What is wrong stands in the words or
-# in the files that `place` makes.
+# The words of the command line, and a part of the message. The mistake is in the words or in the
+# files that `place` makes.
 MISTAKES = {
     # files
     "no such file": ("register none.ply b.ply", "none.ply: cannot be read: No such file"),
@@ -102,7 +102,7 @@ MISTAKES = {
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """A folder with everything that the mistakes need, to stand in."""
+    """The working directory, with every file that the mistakes need."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CFR_JAX_CACHE", "off")
     cloud = io.PointCloud(RNG.normal(size=(80, 3)))
@@ -145,7 +145,7 @@ def place(tmp_path, monkeypatch):
     with h5py.File(tmp_path / "shapes.h5", "w") as file:
         file["data"] = file["normal"] = np.ones((2, 8, 3), np.float32)
         file["label"] = np.zeros(2, np.int64)
-    # As where the extras are not installed.
+    # pretend that the extras are not installed
     monkeypatch.setattr(outputs, "can_draw", lambda: False)
     for name in ("shtab", "torch"):
         monkeypatch.setitem(sys.modules, name, None)
@@ -156,7 +156,7 @@ def place(tmp_path, monkeypatch):
 def test_a_mistake_is_told_with_the_way_out(mistake, place, monkeypatch, capsys):
     # given
     words, said = MISTAKES[mistake]
-    if "--sheet" in words:  # which is refused for another reason than the lack of matplotlib
+    if "--sheet" in words:  # this mistake is not that matplotlib is missing
         monkeypatch.setattr(outputs, "can_draw", lambda: True)
     before = {path: path.read_bytes() for path in place.rglob("*") if path.is_file()}
 
@@ -174,7 +174,7 @@ def test_a_mistake_is_told_with_the_way_out(mistake, place, monkeypatch, capsys)
 
 
 def test_a_cloud_of_a_billion_units_is_no_mistake(place):
-    """Its answer is as good as that of the same cloud in other units (`test_alignment`)."""
+    """Such a cloud is not refused; `test_alignment` shows that units do not change the answer."""
     io.write(place / "far.ply", io.PointCloud(1e9 * RNG.normal(size=(80, 3))))
     from cfr_jax.alignment.planning import planned
 

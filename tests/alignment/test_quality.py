@@ -1,4 +1,4 @@
-"""Fitness by an oracle, and whether free directions are told from held ones."""
+"""Fitness agrees with an oracle, and free directions are told apart from determined ones."""
 
 import functools
 from types import SimpleNamespace
@@ -33,7 +33,7 @@ def with_normals(points, neighbors, mask):
 
 
 def surfaces(source, target):
-    """Both in the target's unit frame, as `align` sees them: padded, with estimated normals."""
+    """Both clouds in the target's unit frame, as in `align`: padded, and with estimated normals."""
     frames = unit_frames(PointCloud(target), PointCloud(target), None)
     units = (
         to_unit(
@@ -165,7 +165,7 @@ def test_the_weakest_directions_are_orthogonal_twists_of_unit_length():
     np.testing.assert_allclose(found.weakest @ found.weakest.T, np.eye(3), atol=1e-5)
 
 
-# rotation first: a plane across z turns about z and slides along x and y, and so on
+# twists with the rotation first: a plane z = 0 turns about z and slides along x and y, and so on
 FREE = {
     "plane": [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0]],
     "sphere": [[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0]],
@@ -199,5 +199,5 @@ def test_the_information_matrix_is_open3ds():
     wanted = o3d.pipelines.registration.get_information_matrix_from_point_clouds(
         *clouds, DISTANCE * frames.scale, np.eye(4)
     )
-    # a pair whose distance rounds across the limit may count on one side only
+    # rounding may let a pair at the limit count for only one of the two libraries
     np.testing.assert_allclose(found, wanted, atol=2e-2 * np.abs(wanted).max())

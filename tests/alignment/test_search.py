@@ -1,4 +1,4 @@
-"""Registration from anywhere: what the search finds, how it ranks, and what it tells of rivals."""
+"""Registration from anywhere: what the search finds, how it ranks, and which rivals it reports."""
 
 import functools
 
@@ -21,7 +21,7 @@ FIT = jax.jit(functools.partial(quality.mutual_fit, reach=0.2))
 
 @pytest.fixture
 def few_starts(monkeypatch):
-    """Fewer starts on smaller clouds: the same code, in a second."""
+    """Fewer starts and smaller clouds, so that the same code takes only a second."""
     monkeypatch.setattr(search, "COARSE_POINTS", 128)
     monkeypatch.setattr(starts, "COUNT", 64)
 
@@ -97,7 +97,7 @@ def test_of_several_starts_the_one_near_the_truth_is_taken(few_starts):
     tried = [solids.motion(angle, (1, 0, 0)) for angle in (0, 90)]
     tried.append(solids.motion(15, (1, 1, 0), (0.03, 0, 0)) @ truth)
 
-    # as many as the cover has, so that they share its compiled program
+    # as many starts as in the cover of all rotations, so that they share its compiled program
     tried = np.resize(tried, (starts.COUNT, 4, 4))
     found = align(source, target, initial=tried, max_points=256)
 

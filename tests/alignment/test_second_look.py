@@ -1,4 +1,4 @@
-"""A second look at answers in doubt: when it is taken, and that it is never worse."""
+"""A second look at doubtful answers: when it is taken, and that it never makes one worse."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ TURN = solids.motion(90, (-1, 1, 0))
 
 @pytest.fixture(scope="module")
 def pair():
-    """Turned further than the network finds from where it lies."""
+    """A pair whose turn is larger than the network can find from where the source lies."""
     return solids.two_samplings(256, TURN)
 
 
@@ -61,7 +61,7 @@ def test_a_start_that_somebody_gave_is_kept(pair):
 
 
 def test_what_is_less_likely_right_is_not_taken(pair, monkeypatch):
-    # given a pair that is answered at once, looked at again all the same, from a half turn
+    # given a pair that needs no second look, but is forced to take one, from a half turn
     easy = pair[0], solids.move(solids.motion(10), pair[0])
     once = align(*easy)
     half = np.array([np.diag([1.0, -1.0, -1.0, 1.0])])
@@ -92,7 +92,7 @@ def test_a_plan_started_elsewhere_is_the_plan_of_a_moved_source(pair):
     np.testing.assert_allclose(
         moved.source.points, solids.move(motion, plan.source.points), atol=1e-6
     )
-    # what maps the moved source onto the target maps the source of the first plan, moved first
+    # a motion of the moved source is the same motion of the first plan's source after `motion`
     unit = solids.motion(-20, (1, 0, 0), (0, 0.3, 0))
     np.testing.assert_allclose(
         moved.frames.to_caller(unit), plan.frames.to_caller(unit @ motion), atol=1e-9

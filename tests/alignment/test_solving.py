@@ -1,4 +1,4 @@
-"""What one `align` sends to the device, runs there and fetches: each once."""
+"""One `align` sends data to the device once, runs one program there, and fetches once."""
 
 import dataclasses
 
@@ -57,7 +57,7 @@ def test_an_accelerator_is_left_the_search_for_neighbors(pair, monkeypatch):
 
 
 def test_one_upload_one_program_and_one_fetch_answer_a_pair(pair, monkeypatch):
-    align(*pair, second_look=False)  # compiled
+    align(*pair, second_look=False)  # compiles the program
     calls = []
 
     def counted(module, name):
@@ -73,7 +73,7 @@ def test_one_upload_one_program_and_one_fetch_answer_a_pair(pair, monkeypatch):
     counted(jax, "device_get")
     counted(programs, "compiled")
 
-    with jax.transfer_guard("disallow"):  # whatever is not said
+    with jax.transfer_guard("disallow"):  # forbids implicit transfers
         found = align(*pair, second_look=False)
 
     assert calls == ["device_put", "compiled", "device_get"]
