@@ -1,4 +1,4 @@
-"""What `merge` answers: the poses, how sure each is, the edges they rest on, and the cloud."""
+"""The answer of `merge`: poses, their covariances, the edges behind them, and the merged cloud."""
 
 from __future__ import annotations
 
@@ -20,50 +20,53 @@ class Edge:
     """Index of the scan that was moved."""
     target: int
     transform: Float[np.ndarray, "4 4"]
-    """What the registration found: maps the source onto the target, in the caller's frames."""
+    """The result of the registration: maps the source onto the target, in the caller's frames."""
     confidence: float | None
-    """Of the registration, as in `Alignment`."""
+    """The confidence of the registration, as in `Alignment`."""
     kept: bool
-    """Whether the poses agree with it. Wrong edges are those that are not kept."""
+    """Whether the poses agree with this edge. An edge that is not kept counts as wrong."""
     residual: float
-    """By how much the poses disagree: how far they move the source's points from where the edge
-    lays them, on average, in the caller's unit. NaN between scans of different components."""
+    """How much the poses disagree with this edge: the mean distance between the places where the
+    poses and the edge put the source's points, in the caller's unit. NaN between scans of different
+    components."""
     distance: float
-    """Root mean square distance of the two scans' points to each other's planes under the final
-    poses. NaN between scans of different components, and where they do not touch."""
+    """The root mean square distance from the source's points to the target's planes under the final
+    poses. NaN between scans of different components, and if the scans do not touch."""
     reason: str
-    """Why it is not kept; empty if it is."""
+    """Why the edge is not kept; empty if it is."""
 
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """Answer of `merge`; everything in the caller's units."""
+    """The answer of `merge`. Everything is in the caller's unit."""
 
     names: tuple[str, ...]
-    """Of all scans, in the order in which they came."""
+    """The names of all scans, in the order of the input."""
     placed: Int[np.ndarray, " p"]
-    """Indices of the scans that have a pose, ascending."""
+    """The indices of the scans that have a pose, in ascending order."""
     poses: Float[np.ndarray, "p 4 4"]
-    """Of each placed scan: maps it into the frame of the reference of its component. Float64."""
+    """The pose of each placed scan, which maps it into the frame of its component's reference.
+    Float64."""
     covariances: Float[np.ndarray, "p 6 6"]
-    """Of each pose: of the twist (rotation in radians, then translation, in the frame of the scan
-    and about its centroid) by which it is off. Zero for a reference."""
+    """The covariance of each pose: of the twist by which the pose is off. The twist has the
+    rotation in radians first, then the translation, in the frame of the scan and about its
+    centroid. Zero for a reference."""
     component: Int[np.ndarray, " p"]
-    """Which model each scan belongs to; 0 is the one with the most scans."""
+    """The model that each placed scan belongs to. Model 0 has the most scans."""
     references: tuple[int, ...]
-    """Index of the scan whose frame is that of the model, for each component."""
+    """For each component, the index of the scan whose frame is the frame of the model."""
     edges: tuple[Edge, ...]
     left_out: tuple[LeftOut, ...]
-    """Scans without a pose, and why. They are in no cloud."""
+    """The scans without a pose, and why they have none. They are in no merged cloud."""
     notes: tuple[str, ...]
-    """What else a reader should know: scans that came twice, parts that stayed apart."""
+    """Remarks for the reader: scans that were given twice, parts that nothing connects."""
     clouds: tuple[Fused, ...]
-    """The merged cloud of each component; empty if `merge` was asked for poses only."""
+    """The merged cloud of each component; empty if only poses were wanted."""
     seconds: dict[str, float]
     """`read`, `register`, `place`, `refine`, `fuse`, and `total`."""
 
     def pose(self, scan: int | str) -> Float[np.ndarray, "4 4"]:
-        """The pose of a scan, by index or name. Raises KeyError for one that has none."""
+        """The pose of a scan, by its index or name. Raises KeyError if it has none."""
         index = scan
         if isinstance(scan, str):
             index = self.names.index(scan) if scan in self.names else -1
@@ -72,6 +75,6 @@ class Merged:
         raise KeyError(f"scan {scan!r} has no pose")
 
     def by_component(self) -> Iterator[tuple[int, Int[np.ndarray, " k"]]]:
-        """Each component, with the rows of its scans in `placed` and `poses`."""
+        """Yields each component's number, with the rows of its scans in `placed` and `poses`."""
         for number in range(len(self.references)):
             yield number, np.flatnonzero(self.component == number)

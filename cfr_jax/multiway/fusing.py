@@ -1,6 +1,6 @@
-"""One cloud of all scans: the mean point of each cube of a grid, scan after scan.
+"""Fuses all scans into one cloud: the mean point of each cube of a grid, scan after scan.
 
-Memory holds one scan and what has been fused so far; the scans are read again one by one.
+Memory holds one scan at a time and the cloud fused so far. The scans are read again one by one.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from cfr_jax.data.scans import estimate_normals
 from cfr_jax.geometry import motions
 from cfr_jax.io import PointCloud
 
-_NEIGHBORS = 16  # of a normal, where the scans bring none
-_COMPACTED = 1 << 22  # rows that may wait before cubes of several scans are put together
-_MOST_CELLS = 1 << 20  # along an axis: what fits three times in 63 bits
+_NEIGHBORS = 16  # points that a normal is estimated from if the scans have no normals
+_COMPACTED = 1 << 22  # rows that may wait before the cubes of several scans are summed
+_MOST_CELLS = 1 << 20  # cells along each axis; three such indices fit in 63 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,35 +27,38 @@ class Fused:
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
-    """Unit normals: the mean of the scans' own, or estimated, pointing away from the centroid."""
+    """Unit normals: the mean of the scans' own normals, or estimated ones that point away from the
+    centroid."""
     scan: Int[np.ndarray, " n"]
-    """Index of the scan that gave most to each point."""
+    """For each point, the index of the scan that contributed the most to it."""
     count: Int[np.ndarray, " n"]
-    """How many points each is the mean of."""
+    """The number of points of which each point is the mean."""
     voxel: float
+    """The edge length of the cubes."""
 
     def as_cloud(self, name: str = "model") -> PointCloud:
-        """Points and normals, as `io.write` takes them."""
+        """The points and normals as a cloud that `io.write` accepts."""
         return PointCloud(self.points, self.normals, name)
 
 
 @dataclass(frozen=True, eq=False)
 class _Cubes:
-    """Sums over the points of each cube; several rows may be of one cube."""
+    """Sums over the points of each cube. Several rows may belong to one cube."""
 
     cell: Int[np.ndarray, "n 3"]
     sums: Float[np.ndarray, "n 6"]
     count: Int[np.ndarray, " n"]
     most: Int[np.ndarray, " n"]
-    """How many came from `scan`, which gave most."""
+    """The number of points from `scan`, the scan that contributed the most."""
     scan: Int[np.ndarray, " n"]
 
 
 def fuse(placed: Iterable[tuple[int, PointCloud, Float[np.ndarray, "4 4"]]], voxel: float) -> Fused:
-    """The mean point of each cube with edges of length `voxel`.
+    """Replaces the points in each cube, with edges of length `voxel`, by their mean.
 
-    `placed` gives the index of each scan, its points, and the motion into the model's frame. Raises
-    ValueError for a voxel that is not positive or far too small for the model, and for no scans.
+    `placed` yields the index of each scan, its points, and its motion into the model's frame.
+    Raises ValueError if the voxel is not positive or far too small for the model, and if there are
+    no scans.
     """
     if not (voxel > 0 and math.isfinite(voxel)):
         raise ValueError(f"voxel: got {voxel}, wanted a positive length")
@@ -75,7 +78,7 @@ def fuse(placed: Iterable[tuple[int, PointCloud, Float[np.ndarray, "4 4"]]], vox
         if waiting > _COMPACTED:
             held, waiting = [_compacted(held)], 0
     if origin is None:
-        raise ValueError("wanted at least one scan to make a cloud of")
+        raise ValueError("placed: got no scans, wanted at least one")
     cubes = _compacted(held)
     points = cubes.sums[:, :3] / cubes.count[:, None] + origin
     normals = cubes.sums[:, 3:]
@@ -116,14 +119,14 @@ def _compacted(held: list[_Cubes]) -> _Cubes:
 
 
 def _summed(cubes: _Cubes) -> _Cubes:
-    """One row for each cube, in the order of the cubes."""
+    """The same sums with a single row for each cube, in the order of the cubes."""
     shifted = cubes.cell + _MOST_CELLS // 2
     key = (shifted[:, 0] * _MOST_CELLS + shifted[:, 1]) * _MOST_CELLS + shifted[:, 2]
-    # within a cube the scan that gave most comes first
+    # within a cube, the scan that contributed the most comes first
     order = np.lexsort((cubes.scan, -cubes.most, key))
     starts = np.flatnonzero(np.diff(key[order], prepend=-1))
     first = order[starts]
-    # what one scan gave is one row already, unless its own points are being summed
+    # each scan already has a single row per cube, unless its own points are being summed now
     own = np.add.reduceat(cubes.count[order], starts)
     same = cubes.scan[order] == np.repeat(cubes.scan[first], np.diff([*starts, len(order)]))
     most = np.add.reduceat(np.where(same, cubes.most[order], 0), starts)

@@ -1,4 +1,4 @@
-"""`merge`: many scans of one thing, and the pose of each in one model."""
+"""`merge` finds the pose of each of many scans of one thing, and makes one model of them."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from cfr_jax.multiway.scans import LeftOut, Scan, load, names_of, of_other_sizes
 from cfr_jax.networks.record import Params
 from cfr_jax.runtime.progress import Progress
 
-_CLOSING = 4  # other scans with which a scan may close loops
-_ENOUGH = 2  # answers of a search that are sure: then a scan needs no more
+_CLOSING = 4  # the number of other scans with which each scan may close loops
+_ENOUGH = 2  # after this many sure answers, the search for a scan ends
 
 
 def merge(
@@ -55,28 +55,30 @@ def merge(
     kept: Kept | None = None,
     progress: bool = False,
 ) -> Merged:
-    """Lays many scans of one thing together: the pose of each, and one cloud.
+    """Merges many scans of one thing: finds the pose of each scan, and makes one cloud.
 
-    `clouds` are what `align` takes. Pairs of them are registered by `align_many`: all, or with
-    `sequence` each with the next two, and with `loop_closures` then also those that the poses so
-    far bring together. Clouds may lie up to about 45 degrees about each axis from each other; with
-    `everywhere`, scans that found no place so are tried from all rotations, too. `guesses` are
-    poses to start from, as far as they are known (None for the others).
+    Each of `clouds` is anything that `align` accepts. `align_many` registers all pairs of them.
+    With `sequence`, each scan is registered only with the next two. With `loop_closures`, pairs
+    that overlap under the poses found so far are then registered as well. Scans may be turned
+    against each other by up to about 45 degrees about each axis. With `everywhere`, scans that
+    found no place are also tried from all rotations. `guesses` are approximate poses to start from;
+    use None for scans whose pose is unknown.
 
     Edges that contradict others are found and dropped, a pose graph is solved, and all scans are
-    refined together. A scan is placed only where a cycle of registrations confirms its place or
-    one is sure of it; all others are listed in `left_out` with the reason. Scans that do not hang
-    together become components of their own.
+    refined together. A scan is placed only if a cycle of registrations confirms its place. If the
+    order of the scans is known or there are only two, a single sure registration is enough. All
+    other scans are listed in `left_out` with the reason. Groups of scans that nothing connects
+    become separate components.
 
-    Poses map each scan into the frame of `reference`, an index (default: the first placed scan).
-    Each component has a merged cloud with one point for each cube of size `voxel` (default: the
-    spacing of the scans' points), unless `fused` is False.
+    Poses map each scan into the frame of the scan with index `reference` (default: the first placed
+    scan). Each component gets a merged cloud with one point for each cube of size `voxel` (default:
+    the spacing of the scans' points), unless `fused` is False.
 
-    `kept` stores what is registered and is asked first (`batch.journal.Journal`), so that a run
-    that was killed goes on where it was. `max_points`, `seed`, `batch` and `workers` are those of
+    `kept` stores the registrations and is looked up first (`batch.journal.Journal`), so a run that
+    was killed continues where it stopped. `max_points`, `seed`, `batch` and `workers` are those of
     `align_many`. The same call gives the same answer.
 
-    Raises ValueError for options that cannot be used, and where fewer than two scans can be read.
+    Raises ValueError for options that cannot be used, and if fewer than two scans can be merged.
     """
     began = time.perf_counter()
     clouds = list(clouds)
@@ -129,10 +131,10 @@ def register_share(
     workers: int | None = None,
     progress: bool = False,
 ) -> int:
-    """Registers only some of the pairs that `merge` would begin with; says how many.
+    """Registers only a part of the pairs that `merge` registers first, and returns their number.
 
-    `rows` are these among all pairs, as `batch.sharding.Shard.rows` gives them. What `kept` then
-    holds, `merge` need not register again.
+    `rows` selects this part of the pairs, as `batch.sharding.Shard.rows` does. The records are
+    stored in `kept`, so `merge` does not register these pairs again.
     """
     clouds = list(clouds)
     _check(clouds, guesses, None, None)
@@ -149,13 +151,14 @@ def register_share(
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """What is known before anything is registered."""
+    """Everything that is known before the first registration."""
 
     names: tuple[str, ...]
     scans: list[Scan]
-    """Those that can be registered."""
+    """The scans that can be registered."""
     left_out: list[LeftOut]
     copies: dict[int, int]
+    """The index of each repeated scan, with the index of the first scan that has its points."""
     registrar: Registrar
     tries: list[Try]
 
@@ -233,8 +236,11 @@ def _search(
     records: list[Record],
     alone: bool,
 ) -> tuple[list[Try], list[Record], Build]:
-    """Tries scans that are not in the largest component from all rotations, one after the other:
-    a search takes some times as long, and a scan that has found its place needs no other."""
+    """Tries the scans outside the largest component from all rotations, one after the other.
+
+    A search takes several times as long as a plain registration, so it ends for each scan as soon
+    as the scan has found its place.
+    """
     built = build(scans, tries, records, alone=alone)
     for row in np.flatnonzero(built.placement.component > 0).tolist():
         if built.placement.component[row] == 0:
@@ -279,7 +285,7 @@ def _fused(
         def members(rows: np.ndarray) -> Iterator[tuple[int, PointCloud, np.ndarray]]:
             for row in rows:
                 index = int(found.placed[row])
-                if index not in copies:  # the same points again would count twice
+                if index not in copies:  # otherwise the same points would count twice
                     cloud = as_point_cloud(clouds[index], name=found.names[index])
                     yield index, cloud, found.poses[row]
                 bar.update()
@@ -290,5 +296,5 @@ def _fused(
 
 
 def _full_spacing(scan: Scan) -> float:
-    """About the distance between neighbors among all points of a scan, on a surface."""
+    """An estimate of the spacing of all points of a scan, before thinning, for a surface."""
     return scan.spacing * float(np.sqrt(len(scan.cloud) / scan.total))

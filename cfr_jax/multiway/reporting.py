@@ -1,4 +1,4 @@
-"""What was built, in the caller's frames and words."""
+"""Reports a finished build in the caller's frames, with reasons in words."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from cfr_jax.multiway.building import Build, measured
 from cfr_jax.multiway.pose_graph import placing
 from cfr_jax.multiway.scans import LeftOut, Scan
 
-# Of a scan's radius, standard deviation: where a scan may slide so far, its place is open.
+# A scan whose points have a standard deviation of more than this share of its radius has no
+# determined place.
 _FREE = 0.2
 
 
@@ -27,15 +28,18 @@ def answer(
     copies: Mapping[int, int],
     reference: int | None,
 ) -> Merged:
-    """The answer without clouds and times. `scans` are those of the rows in `built`; `copies` are
-    scans that came twice, with the index of the first of them."""
+    """The answer without merged clouds and times.
+
+    `scans` belong to the rows in `built`. `copies` maps the index of each repeated scan to the
+    index of the first scan with the same points. `left_out` are the scans that could not be used.
+    """
     placement = built.placement
     sizes = np.bincount(placement.component)
     free = np.array(
         [_freedom(scan, spread) for scan, spread in zip(scans, covariances, strict=True)]
     )
     held = (sizes[placement.component] > 1) & (free <= _FREE) & ~built.ambiguous
-    # a component may lose so many scans that hardly one is left
+    # a component that has lost all scans but one is no component any longer
     held &= np.bincount(placement.component, held, len(sizes))[placement.component] > 1
     missing = list(left_out)
     for row in np.flatnonzero(~held).tolist():
@@ -69,7 +73,8 @@ def answer(
 def _in_frames(
     scans: Sequence[Scan], built: Build, held: np.ndarray, reference: int | None
 ) -> tuple[Float[np.ndarray, "n 4 4"], tuple[int, ...], Int[np.ndarray, " n"]]:
-    """Poses of the caller's clouds, the reference of each component, and the components."""
+    """The poses of the caller's clouds, the reference of each component, and the component of each
+    scan."""
     placement = built.placement
     labels, poses = np.full(len(scans), -1), placement.poses.copy()
     counts = np.bincount(placement.component[held], minlength=placement.component.max() + 1)
@@ -143,14 +148,17 @@ def _reason(row: int, scans: Sequence[Scan], built: Build, open_: bool) -> str:
     own = np.flatnonzero((edges.source == row) | (edges.target == row))
     if not len(own):
         failed = [reason for source, target, reason in built.failures if row in (source, target)]
-        return failed[0] if failed else "it was registered with no other scan"
+        return failed[0] if failed else "it was not registered with any other scan"
     best = int(own[np.argmax(built.confidence[own])])
     other = int(edges.target[best] if edges.source[best] == row else edges.source[best])
-    return f"not sure of any place; best with {scans[other].name}: {_doubt(built, best, False)}"
+    return (
+        f"no place is sure; the best registration is with {scans[other].name}: "
+        f"{_doubt(built, best, False)}"
+    )
 
 
 def _freedom(scan: Scan, covariance: Float[np.ndarray, "6 6"]) -> float:
-    """Standard deviation of a scan's points along the direction that is least sure, in radii."""
+    """The standard deviation of a scan's points along the least certain direction, in radii."""
     size = np.array([scan.radius] * 3 + [1.0] * 3)
     worst = np.linalg.eigvalsh(covariance * np.outer(size, size))[-1]
     return float(np.sqrt(max(worst, 0.0)) / scan.radius)
@@ -163,13 +171,13 @@ def _notes(
     labels: Int[np.ndarray, " n"],
 ) -> tuple[str, ...]:
     notes = [
-        f"{names[copy]} has the same points as {names[first]} and counts once"
+        f"{names[copy]} has the same points as {names[first]}, so they count once"
         for copy, first in copies.items()
     ]
     if len(references) > 1:
         counts = [int((labels == number).sum()) for number in range(len(references))]
         notes.append(
-            f"the scans are {len(references)} models that nothing connects, of "
+            f"the scans form {len(references)} models that nothing connects, of "
             f"{', '.join(map(str, counts[:-1]))} and {counts[-1]} scans"
         )
     return tuple(notes)
