@@ -1,1 +1,1 @@
-"""Poses from measured motions: the graph, its wrong edges, and what hangs together."""
+"""Finds poses from measured motions: solves the graph, finds wrong edges and connected parts."""

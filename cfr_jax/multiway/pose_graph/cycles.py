@@ -1,7 +1,7 @@
-"""Cycles of three: three scans whose motions, one after the other, should lead back to the start.
+"""Cycles of three: the motions between three scans, composed, should lead back to the start.
 
-Two wrong motions hardly ever cancel out with a third. So an edge that closes a cycle is confirmed
-by two others, whatever each of them is worth alone.
+A wrong motion hardly ever cancels out with two others. So if a cycle closes, each of its edges is
+confirmed by the other two, however uncertain each of them is alone.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cfr_jax.multiway.pose_graph.robust import LIMIT
 
 
 def triangles(edges: Edges) -> Int[np.ndarray, "t 3"]:
-    """Every three edges that connect three scans; at most one edge connects two scans."""
+    """All triples of edges that connect three scans. At most one edge may connect two scans."""
     beside: dict[int, dict[int, int]] = defaultdict(dict)
     for row, (a, b) in enumerate(zip(edges.source.tolist(), edges.target.tolist(), strict=True)):
         beside[a][b] = beside[b][a] = row
@@ -31,13 +31,13 @@ def triangles(edges: Edges) -> Int[np.ndarray, "t 3"]:
 
 
 def closed(edges: Edges, cycles: Int[np.ndarray, "t 3"]) -> Bool[np.ndarray, " t"]:
-    """Which cycles lead back to the start, as far as the noise of their edges allows."""
+    """Whether each cycle leads back to the start, within the noise of its edges."""
     if not len(cycles):
         return np.zeros(0, bool)
     spread = np.linalg.inv(edges.information)
     around = np.broadcast_to(np.eye(4), (len(cycles), 4, 4))
     expected = np.zeros((len(cycles), 6, 6))
-    # the three scans a, b, c: from a over b and c back to a
+    # for the three scans a, b and c: from a to b, from b to c, and from c back to a
     a, b = edges.source[cycles[:, 0]], edges.target[cycles[:, 0]]
     ends = edges.source[cycles[:, 1]], edges.target[cycles[:, 1]]
     c = np.where(ends[0] == a, ends[1], ends[0])
@@ -46,7 +46,7 @@ def closed(edges: Edges, cycles: Int[np.ndarray, "t 3"]) -> Bool[np.ndarray, " t
         motion = np.where(
             forward[:, None, None], edges.transform[row], twists.inverse(edges.transform[row])
         )
-        # of a motion taken backward, the noise stands on its other side
+        # the noise of a backward motion is on its other side
         turned = twists.adjoint(edges.transform[row])
         noise = np.where(
             forward[:, None, None], spread[row], turned @ spread[row] @ turned.swapaxes(-1, -2)
@@ -60,7 +60,7 @@ def closed(edges: Edges, cycles: Int[np.ndarray, "t 3"]) -> Bool[np.ndarray, " t
 
 
 def votes(edges: Edges) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"]]:
-    """Of each edge: how many of its cycles close, and how many it has."""
+    """For each edge, the number of its cycles that close, and the number of all its cycles."""
     cycles = triangles(edges)
     good = closed(edges, cycles)
     return tuple(  # type: ignore[return-value]
@@ -71,5 +71,6 @@ def votes(edges: Edges) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"]]:
 def confirmed_order(
     closing: Int[np.ndarray, " e"], having: Int[np.ndarray, " e"], prior: Float[np.ndarray, " e"]
 ) -> Float[np.ndarray, " e"]:
-    """How good an edge is to build on: the share of its cycles that close, then its confidence."""
+    """A score of how well an edge is confirmed: mostly the share of its cycles that close, and then
+    its confidence (`prior`)."""
     return closing / np.maximum(having, 1) + 0.5 * (closing > 0) + 0.1 * prior

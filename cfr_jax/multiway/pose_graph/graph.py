@@ -1,12 +1,14 @@
-"""The pose graph: the poses that agree best with measured motions between scans.
+"""The pose graph: finds the poses that agree best with measured motions between scans.
 
-An edge measured M, which maps its source scan onto its target scan. With poses P, its residual is
-log(M^-1 P_target^-1 P_source): how far, in the source's frame, the poses are from the measurement.
-The poses minimize the sum of squared residuals, each weighed by the edge's information matrix.
+The measurement M of an edge maps its source scan onto its target scan. For poses P, the residual of
+the edge is log(M^-1 P_target^-1 P_source): the difference between the poses and the measurement, in
+the source's frame. The poses minimize the sum of squared residuals, each weighted by the edge's
+information matrix.
 
-scipy's `least_squares` solves it, with the analytic and sparse Jacobian. GTSAM and optimistix would
-do as well: but GTSAM has no wheels for all systems and Python versions of this package, optimistix
-knows no sparse Jacobians, and the graphs of some thousand scans take seconds here.
+scipy's `least_squares` solves this with the analytic and sparse Jacobian. GTSAM and optimistix
+could solve it, too. But GTSAM lacks wheels for some systems and Python versions that this package
+supports, and optimistix has no sparse Jacobians. With scipy, a graph of a thousand scans takes
+seconds.
 """
 
 from __future__ import annotations
@@ -21,41 +23,41 @@ from scipy.sparse import linalg
 
 from cfr_jax.geometry import twists
 
-_ROUNDS = 20  # linearizations about new poses; two or three are enough near the answer
-_STEPS = 20
+_ROUNDS = 20  # restarts of the solver at new poses; two or three are enough near the answer
+_STEPS = 20  # most evaluations in each round
 _SETTLED = 1e-9  # radians and units of length
 
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Measured motions between scans, one a row."""
+    """Measured motions between scans, one per row."""
 
     source: Int[np.ndarray, " e"]
     target: Int[np.ndarray, " e"]
     transform: Float[np.ndarray, "e 4 4"]
     """Maps the source scan onto the target scan."""
     information: Float[np.ndarray, "e 6 6"]
-    """Inverse covariance of the twist d, in the source's frame, by which the measurement is off:
-    the true motion is transform @ exp(d)."""
+    """The inverse covariance of the error of the measurement. The error is a twist d in the
+    source's frame: the true motion is transform @ exp(d)."""
 
     def __len__(self) -> int:
         return len(self.source)
 
     def take(self, rows: Int[np.ndarray, " k"] | Bool[np.ndarray, " e"]) -> Edges:
-        """Some of the edges."""
+        """The edges in these rows."""
         return Edges(
             self.source[rows], self.target[rows], self.transform[rows], self.information[rows]
         )
 
 
 def residuals(edges: Edges, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "e 6"]:
-    """How far the poses are from each measurement, as a twist in the source's frame."""
+    """The difference between the poses and each measurement, as a twist in the source's frame."""
     between = twists.inverse(poses[edges.target]) @ poses[edges.source]
     return twists.log(twists.inverse(edges.transform) @ between)
 
 
 def chi_squares(edges: Edges, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " e"]:
-    """The squared residuals, in units of their variance: 6 each is what noise alone makes."""
+    """The squared residuals in units of their variance. Noise alone makes 6 on average."""
     off = residuals(edges, poses)
     return np.einsum("ei,eij,ej->e", off, edges.information, off)
 
@@ -66,7 +68,7 @@ def solve(
     fixed: Bool[np.ndarray, " n"],
     weights: Float[np.ndarray, " e"] | None = None,
 ) -> Float[np.ndarray, "n 4 4"]:
-    """The best poses near `poses`; those that are `fixed` stay.
+    """Finds the best poses, starting from `poses`. Scans that are `fixed` do not move.
 
     Every connected part of the graph needs a fixed scan. `weights` multiply the information.
     """
@@ -75,11 +77,12 @@ def solve(
     edges, weights = edges.take(held), weights[held]
     if not len(edges) or fixed.all():
         return poses
-    # Lᵀ of information = L Lᵀ: it makes the residuals' covariance the identity
+    # Lᵀ, where information = L Lᵀ; it turns the residuals' covariance into the identity
     whitening = np.linalg.cholesky(edges.information).swapaxes(-1, -2)
     whitening = whitening * np.sqrt(weights)[:, None, None]
     for _ in range(_ROUNDS):
-        # about the present poses, where the parameters are zero, so that no turn comes near pi
+        # The parameters are steps from the present poses and start at zero, so no rotation angle
+        # comes near pi.
         found = least_squares(
             _whitened,
             np.zeros(6 * int((~fixed).sum())),
@@ -99,9 +102,9 @@ def solve(
 def covariances(
     edges: Edges, poses: Float[np.ndarray, "n 4 4"], fixed: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 6 6"]:
-    """The covariance of each pose, given the `fixed` ones; zero for those.
+    """The covariance of each pose relative to the `fixed` ones, for which it is zero.
 
-    It is that of the twist d, in the scan's own frame, with true pose = pose @ exp(d).
+    It is the covariance of the twist d in the scan's own frame, with true pose = pose @ exp(d).
     """
     found = np.zeros((len(poses), 6, 6))
     if not len(edges) or fixed.all():
@@ -142,10 +145,10 @@ def _jacobian(
     fixed: Bool[np.ndarray, " n"],
     whitening: Float[np.ndarray, "e 6 6"],
 ) -> sparse.csr_matrix:
-    """Of `_whitened`: two blocks of 6 x 6 for each edge.
+    """The Jacobian of `_whitened`, which has two blocks of 6 x 6 for each edge.
 
-    With right Jacobians J: a step d of the source's pose turns the residual r by J(r)^-1 J(x) d,
-    one of the target's by -J(r)^-1 Ad(P_source^-1 P_target) J(x) d.
+    With right Jacobians J, a step d of the source's pose changes the residual r by J(r)^-1 J(x) d.
+    A step d of the target's pose changes it by -J(r)^-1 Ad(P_source^-1 P_target) J(x) d.
     """
     moved = _moved(poses, fixed, steps)
     away = twists.inverse(moved[edges.source]) @ moved[edges.target]

@@ -1,9 +1,9 @@
-"""From edges to poses: which edges to build on, which scans belong together, where each lies.
+"""From edges to poses: which edges to rely on, which scans belong together, and where each lies.
 
-Only motions that the scans determine count. An edge is built on where a cycle of three confirms
-it; however confident it is alone, it may be the other way in which a nearly symmetric thing fits.
-Parts of a model that are found so are put together where two edges between them agree. What is then
-not connected stays apart.
+Only motions that the scans determine count. An edge is relied on only if a cycle of three confirms
+it. Its own confidence is not enough, because a nearly symmetric thing fits in more than one way.
+The parts of a model that are found in this way are joined if two edges between them agree. Parts
+that are still not connected stay separate.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from cfr_jax.multiway.pose_graph import cycles, graph, robust
 from cfr_jax.multiway.pose_graph.graph import Edges
 from cfr_jax.multiway.pose_graph.robust import LIMIT
 
-SURE = 0.9  # confidence that needs no confirmation, where there can be none
+SURE = 0.9  # edges of this confidence need no confirmation, if there can be none
 TRUSTED = 0.5
-# An edge that leaves its scan so far from where the poses lay it is another answer, and no error.
-_FAR_TURN, _FAR_PLACE = np.radians(15.0), 0.15  # of a radius
-# Of trusted edges, by confidence, that are other answers. Of 40 shapes seen from 12 sides
-# (`tools/make_views.py`), those whose scans were placed right had at most 10 %; those that fit in
-# several ways and were placed wrong had 14 % or more, but for a mug, a creamer and a cooker.
+# An edge that differs from the poses by more than this is a different answer, and not only noisy.
+_FAR_TURN, _FAR_PLACE = np.radians(15.0), 0.15  # the second is a share of the radius
+# The largest share of trusted edges, weighted by confidence, that may be different answers. Of 40
+# shapes seen from 12 sides (`tools/make_views.py`), those whose scans were placed right had at most
+# 10 %. Those that fit in several ways and were placed wrong had 14 % or more, except for a mug, a
+# creamer and a cooker.
 MOST_OTHERS = 0.12
-POSSIBLE = 0.3  # below this, an edge is not looked at
+POSSIBLE = 0.3  # edges of less confidence are ignored
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +38,13 @@ class Placement:
     """Poses and edges that agree with each other."""
 
     poses: Float[np.ndarray, "n 4 4"]
-    """Of each scan, in the frame of the first scan of its component."""
+    """The pose of each scan, in the frame of the first scan of its component."""
     component: Int[np.ndarray, " n"]
-    """0 for the largest; a scan alone is a component, too."""
+    """The component of each scan. The largest is 0; a single scan is a component, too."""
     kept: Bool[np.ndarray, " e"]
-    """Edges that the poses agree with."""
+    """Whether the poses agree with each edge."""
     strong: Bool[np.ndarray, " e"]
-    """Edges that could be built on."""
+    """Whether each edge was good enough to be relied on (`build_on`)."""
 
 
 def place(
@@ -54,10 +55,10 @@ def place(
     *,
     alone: bool = False,
 ) -> Placement:
-    """Poses for `count` scans. At most one edge may connect two scans.
+    """Finds poses for `count` scans. At most one edge may connect two scans.
 
-    With `alone`, an edge of high confidence needs no cycle: where the order of the scans says that
-    it should be there, or where two scans are all.
+    With `alone`, an edge of high confidence needs no cycle. Use this if the order of the scans says
+    that the edge should exist, or if there are only two scans.
     """
     strong = build_on(edges, confidence, determined, alone=alone)
     closing, having = cycles.votes(edges)
@@ -71,7 +72,7 @@ def place(
             edges.take(held), poses, fixed, prior=confidence[held]
         )
         if not agreeing.all():
-            # this may leave parts that hang together no more: then each is solved alone
+            # this may disconnect parts of the graph; each part is then solved separately
             rejected[np.flatnonzero(held)[~agreeing]] = True
             held &= ~rejected
             continue
@@ -81,7 +82,7 @@ def place(
             break
         held |= more
     within = labels[edges.source] == labels[edges.target]
-    # edges that were too weak to build on may still agree
+    # edges that were too weak to rely on may still agree with the poses
     off = graph.chi_squares(edges, poses)
     kept = held | (within & (confidence >= POSSIBLE) & (off <= LIMIT))
     return Placement(poses, labels, kept, strong)
@@ -94,11 +95,11 @@ def build_on(
     *,
     alone: bool,
 ) -> Bool[np.ndarray, " e"]:
-    """Which edges are good enough to give scans their places.
+    """Whether each edge is good enough to rely on when scans are placed.
 
-    One that is sure and counts `alone` must not be in a cycle of sure edges that does not close.
+    A sure edge that counts `alone` must not be in a cycle of sure edges that does not close.
     """
-    # what slides or turns freely closes cycles by chance: it stays about where it lay
+    # an edge that slides or turns freely closes cycles by chance, as it stays about where it lay
     possible = determined & (confidence >= POSSIBLE)
     strong = np.zeros(len(edges), bool)
     rows = np.flatnonzero(possible)
@@ -121,10 +122,11 @@ def share_of_others(
     determined: Bool[np.ndarray, " e"],
     radius: float,
 ) -> Float[np.ndarray, " c"]:
-    """Of each component: how many of its trusted edges, by confidence, lay scans elsewhere.
+    """For each component, the share of its trusted edges, weighted by confidence, that contradict
+    the poses.
 
-    Scans of a nearly symmetric thing fit together in several ways, and many edges tell of each of
-    them. Then nobody knows which is right.
+    Scans of a nearly symmetric thing fit together in several ways, and many edges support each of
+    these ways. Then nothing says which one is right.
     """
     labels = placement.component
     off = graph.residuals(edges, placement.poses)
@@ -144,7 +146,8 @@ def agreeing_between(
     labels: Int[np.ndarray, " n"],
     among: Bool[np.ndarray, " e"],
 ) -> Bool[np.ndarray, " e"]:
-    """Edges between two components that lay these on each other in the same way: two or more."""
+    """Marks edges between two components if at least two of them join the components in the same
+    way."""
     rows = np.flatnonzero(among & (labels[edges.source] != labels[edges.target]))
     chosen = np.zeros(len(edges), bool)
     parts = np.sort(np.stack([labels[edges.source], labels[edges.target]], axis=1), axis=1)
@@ -165,13 +168,14 @@ def _agreeing(
     row: int,
     others: Int[np.ndarray, " k"],
 ) -> Bool[np.ndarray, " k"]:
-    """Which of the others agree with one edge, once it has laid one component on the other."""
+    """Which of the `others` agree with the edge in `row` after that edge has joined the
+    components."""
     source, target = edges.source[row], edges.target[row]
     laid = poses[target] @ edges.transform[row] @ twists.inverse(poses[source])
     moved = np.where((labels == labels[source])[:, None, None], laid @ poses, poses)
     taken = edges.take(others)
     off = graph.residuals(taken, moved)
-    # the edge that lays them is noisy itself, and moves what is far from it by more
+    # the joining edge is noisy itself, and its noise moves distant scans farther
     carried = twists.adjoint(twists.inverse(moved[taken.source]) @ moved[source])
     noise = carried @ np.linalg.inv(edges.information[row]) @ carried.swapaxes(-1, -2)
     spread = np.linalg.inv(taken.information) + noise
@@ -186,7 +190,8 @@ def first_of_each(labels: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
 
 
 def _components(count: int, edges: Edges) -> Int[np.ndarray, " n"]:
-    """The number of each scan's component, the largest first, equal ones in order."""
+    """The number of each scan's component. Larger components come first; equal ones keep their
+    order."""
     links = sparse.coo_matrix(
         (np.ones(len(edges)), (edges.source, edges.target)), shape=(count, count)
     )
@@ -200,7 +205,7 @@ def _components(count: int, edges: Edges) -> Int[np.ndarray, " n"]:
 def _along_tree(
     count: int, edges: Edges, order: Float[np.ndarray, " e"], fixed: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """First poses: from the fixed scans on, always along the best edge that leads to a new one."""
+    """Initial poses: starts at the fixed scans and always follows the best edge to a new scan."""
     poses = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
     known = fixed.copy()
     for row in _tree(count, edges, order, fixed):
@@ -217,7 +222,8 @@ def _along_tree(
 def _tree(
     count: int, edges: Edges, order: Float[np.ndarray, " e"], fixed: Bool[np.ndarray, " n"]
 ) -> list[int]:
-    """Rows of a spanning forest of the best edges, each next to what came before (Prim)."""
+    """The rows of a spanning forest of the best edges, in the order of Prim's algorithm: each edge
+    touches a scan that is already known."""
     beside: list[list[int]] = [[] for _ in range(count)]
     for row, ends in enumerate(zip(edges.source.tolist(), edges.target.tolist(), strict=True)):
         for scan in ends:

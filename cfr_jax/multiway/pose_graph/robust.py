@@ -1,8 +1,9 @@
-"""Which edges of a pose graph are wrong, found while it is solved: graduated non-convexity.
+"""Finds the wrong edges of a pose graph while solving it, by graduated non-convexity.
 
-Truncated least squares lets an edge count only as far as noise can explain its residual. From a
-nearly convex version of it, in which wrong edges pull but do not decide, the problem is made
-sharper step by step (Yang, Antonante, Tzoumas & Carlone, RA-L 2020).
+In truncated least squares, the cost of an edge stops growing where noise cannot explain its
+residual. The solver starts from a nearly convex version of this problem, in which wrong edges pull
+but do not decide, and makes it sharper step by step (Yang, Antonante, Tzoumas & Carlone, RA-L
+2020).
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from scipy.stats import chi2
 
 from cfr_jax.multiway.pose_graph.graph import Edges, chi_squares, solve
 
-# Of right edges, one in ten thousand is further off than this many squared standard deviations.
+# One right edge in ten thousand is off by more than this many squared standard deviations.
 LIMIT = float(chi2.ppf(0.9999, df=6))
-_SHARPER = 1.6  # from one step to the next
+_SHARPER = 1.6  # the factor on the control parameter from one step to the next
 _MOST_STEPS = 60
 
 
@@ -25,9 +26,10 @@ def solve_robustly(
     fixed: Bool[np.ndarray, " n"],
     prior: Float[np.ndarray, " e"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " e"]]:
-    """The poses, and which edges they agree with; `prior` weighs edges against each other.
+    """Returns the poses, and whether each edge agrees with them. `prior` weights the edges relative
+    to each other.
 
-    Every scan that is not `fixed` needs edges to a fixed one.
+    A path of edges must connect every scan to one that is `fixed`.
     """
     prior = np.ones(len(edges)) if prior is None else prior
     poses = solve(edges, poses, fixed, prior)
@@ -46,12 +48,13 @@ def solve_robustly(
     return solve(edges, poses, fixed, prior * np.maximum(kept, _LEAST)), kept
 
 
-# What is left of a rejected edge: too little to matter, enough for a scan that has no other.
+# The weight that a rejected edge keeps. It is too small to matter, but enough to hold a scan that
+# has no other edge.
 _LEAST = 1e-8
 
 
 def _weights(off: Float[np.ndarray, " e"], control: float) -> Float[np.ndarray, " e"]:
-    """Of each edge, by its squared residual; equation 14 of the paper."""
+    """The weight of each edge, from its squared residual (equation 14 of the paper)."""
     low, high = control / (control + 1) * LIMIT, (control + 1) / control * LIMIT
     between = np.sqrt(LIMIT * control * (control + 1) / np.maximum(off, 1e-300)) - control
     return np.where(off <= low, 1.0, np.where(off >= high, 0.0, np.clip(between, 0, 1)))
