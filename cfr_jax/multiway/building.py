@@ -1,4 +1,4 @@
-"""From registered pairs to a model: the graph of what was measured, and the places it gives."""
+"""Builds a model from registered pairs: makes a pose graph of them and solves it for the poses."""
 
 from __future__ import annotations
 
@@ -16,33 +16,36 @@ from cfr_jax.multiway.pose_graph.placing import Placement
 from cfr_jax.multiway.registering import Record
 from cfr_jax.multiway.scans import Scan
 
-REACH = 3.0  # spacings: how far two points may be apart and still say something of an edge
+REACH = 3.0  # pairs of points up to this many spacings apart count for the information of an edge
 PARTNERS = 6  # scans with which a scan is refined together
 
 
 @dataclass(frozen=True, eq=False)
 class Build:
-    """Registered pairs as the edges of a graph, and what followed. Scans are rows here."""
+    """Registered pairs as the edges of a graph, and the poses found from them. Here, scans are
+    numbered by their row among the usable scans."""
 
     records: tuple[Record, ...]
-    """What was found of each edge."""
+    """The registration record of each edge."""
     edges: graph.Edges
     confidence: Float[np.ndarray, " e"]
-    """0 where it is unknown."""
+    """The confidence of each edge; 0 if it is unknown."""
     determined: Bool[np.ndarray, " e"]
+    """Whether the two scans of an edge determine its motion."""
     failures: tuple[tuple[int, int, str], ...]
-    """Pairs that could not be registered at all, and why."""
+    """The pairs that could not be registered at all: source, target, and why."""
     placement: Placement
     ambiguous: Bool[np.ndarray, " n"]
-    """Scans that fit together in more than one way: none of their places is sure."""
+    """Whether a scan fits with its component in more than one way, so that its place is unsure."""
 
 
 def build(
     scans: Sequence[Scan], tries: Sequence[Try], records: Sequence[Record], *, alone: bool
 ) -> Build:
-    """Poses from registered pairs. Of several records of two scans, the most confident counts.
+    """Finds poses from registered pairs. If two scans have several records, the most confident one
+    counts.
 
-    `alone` is that of `placing.place`.
+    `alone` is passed on to `placing.place`.
     """
     row_of = {scan.index: row for row, scan in enumerate(scans)}
     best: dict[frozenset[int], tuple[Try, Record]] = {}
@@ -88,7 +91,8 @@ def build(
 def measured(
     source: Scan, target: Scan, transform: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, "6 6"], float]:
-    """Information of a motion between two scans, and the RMS distance to the planes."""
+    """The information matrix of a motion between two scans, and the RMS distance from the source's
+    points to the target's planes."""
     reach = REACH * max(source.spacing, target.spacing)
     return contact.information(source, target, transform, reach)
 
@@ -96,10 +100,11 @@ def measured(
 def refined(
     scans: Sequence[Scan], built: Build, reference: int | None
 ) -> tuple[Build, Float[np.ndarray, "n 6 6"]]:
-    """The same, with each component refined as a whole, and the covariance of each pose.
+    """Refines each component as a whole. Returns the refined build and the covariance of each pose.
 
-    The covariance is that of a pose graph of all pairs that were refined together, each with the
-    information of its surfaces, relative to the `reference`, or to the first scan of a component.
+    The covariances come from a pose graph of all pairs that were refined together. The information
+    of each pair comes from its surfaces. Covariances are relative to the `reference`, or to the
+    first scan of a component without it.
     """
     placement = built.placement
     poses = placement.poses.copy()
@@ -124,7 +129,8 @@ def _pairs(
     rows: Int[np.ndarray, " n"],
     built: Build,
 ) -> Int[np.ndarray, "p 2"]:
-    """What to refine together: scans that overlap most, and those that an edge ties together."""
+    """The pairs to refine together: those that overlap most, and those that a kept edge
+    connects."""
     place = {row: number for number, row in enumerate(rows.tolist())}
     found = {tuple(pair) for pair in choosing.overlapping(scans, poses, PARTNERS).tolist()}
     held = np.flatnonzero(built.placement.kept & built.placement.strong)

@@ -1,4 +1,4 @@
-"""Which pairs of scans to register, and in which direction."""
+"""Chooses which pairs of scans to register, and in which direction."""
 
 from __future__ import annotations
 
@@ -12,31 +12,32 @@ from jaxtyping import Float, Int
 from cfr_jax.geometry import motions, twists
 from cfr_jax.multiway.scans import Scan
 
-# Neighbors in a sequence, and their neighbors: without these, no edge would be in a cycle of three.
+# In a sequence, each scan is tried with the next two. With only the next one, no edge would be in a
+# cycle of three.
 AHEAD = 2
-_OVERLAP = 0.3  # of the smaller scan: less is little to register by
-_PROBED = 200  # points of a scan by which an overlap is estimated
-_REACH = 2.0  # spacings; a point with another one so near was seen by both
-_NEAREST = 24  # scans whose overlap with a scan is looked at
+_OVERLAP = 0.3  # share of a scan that must overlap; less is too little for a registration
+_PROBED = 200  # points of a scan from which its overlap is estimated
+_REACH = 2.0  # spacings; if another scan has a point within this distance, both saw the place
+_NEAREST = 24  # nearest scans whose overlap with a scan is estimated
 
 
 @dataclass(frozen=True, eq=False)
 class Try:
-    """A pair of scans, by index, to be registered."""
+    """A pair of scans to register, given by their indices."""
 
     source: int
     target: int
     initial: Float[np.ndarray, "4 4"] | None = None
-    """Where the source starts, in the caller's frames."""
+    """The motion from which the registration starts, in the caller's frames."""
 
 
 def all_pairs(scans: Sequence[Scan]) -> list[Try]:
-    """Every scan with every other."""
+    """Pairs every scan with every other."""
     return _ordered(scans, itertools.combinations(scans, 2))
 
 
 def in_sequence(scans: Sequence[Scan], ahead: int = AHEAD) -> list[Try]:
-    """Every scan with the next ones."""
+    """Pairs every scan with the `ahead` scans that follow it."""
     places = [
         (scans[row], scans[row + gap])
         for gap in range(1, ahead + 1)
@@ -46,7 +47,7 @@ def in_sequence(scans: Sequence[Scan], ahead: int = AHEAD) -> list[Try]:
 
 
 def from_guesses(tries: Iterable[Try], guesses: dict[int, Float[np.ndarray, "4 4"]]) -> list[Try]:
-    """The same pairs, started where guessed poses lay them, if both are guessed."""
+    """The same pairs, each with a start from the guessed poses of its scans if both are guessed."""
     return [
         Try(pair.source, pair.target, np.linalg.inv(guesses[pair.target]) @ guesses[pair.source])
         if pair.source in guesses and pair.target in guesses
@@ -58,7 +59,7 @@ def from_guesses(tries: Iterable[Try], guesses: dict[int, Float[np.ndarray, "4 4
 def overlapping(
     scans: Sequence[Scan], poses: Float[np.ndarray, "n 4 4"], most: int
 ) -> Int[np.ndarray, "p 2"]:
-    """Pairs of rows whose scans overlap where the poses lay them: of each scan the `most` best."""
+    """Pairs of rows whose scans overlap under the poses: for each scan, at most the `most` best."""
     places = poses[:, :3, 3]
     radii = np.array([scan.radius for scan in scans])
     found: dict[tuple[int, int], float] = {}
@@ -81,7 +82,8 @@ def brought_together(
     known: set[frozenset[int]],
     most: int,
 ) -> list[Try]:
-    """Pairs that overlap where the poses lay them, and were not tried: closures of loops."""
+    """Pairs that overlap under the poses but were not tried before: candidates for loop
+    closures."""
     rows = [
         (first, second)
         for first, second in overlapping(scans, poses, most)
@@ -108,7 +110,7 @@ def to_caller(
     source_center: Float[np.ndarray, " 3"],
     target_center: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, "4 4"]:
-    """A motion between centered scans as one of the caller's clouds."""
+    """Converts a motion between centered scans to one between the caller's clouds."""
     turn = between[:3, :3]
     return motions.motion(turn, target_center + between[:3, 3] - turn @ source_center)
 
@@ -118,17 +120,17 @@ def to_centered(
     source_center: Float[np.ndarray, " 3"],
     target_center: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, "4 4"]:
-    """The inverse of `to_caller`."""
+    """Converts a motion between the caller's clouds to one between centered scans."""
     return motions.motion(
         transform[:3, :3], motions.apply(transform, source_center) - target_center
     )
 
 
 def _ordered(scans: Sequence[Scan], places: Iterable[tuple[Scan, Scan]]) -> list[Try]:
-    """Each onto the larger of the two, those with one target after each other.
+    """Registers each pair onto its larger scan, and orders the pairs by target.
 
-    A pair is scaled by its larger scan. So a target is the same for all of its sources, and is
-    encoded once.
+    A pair is scaled by its larger scan. So a target is scaled the same way for all of its sources,
+    and is encoded only once.
     """
     tries = []
     for first, second in places:
@@ -138,7 +140,7 @@ def _ordered(scans: Sequence[Scan], places: Iterable[tuple[Scan, Scan]]) -> list
 
 
 def _overlap(first: Scan, second: Scan, first_pose: np.ndarray, second_pose: np.ndarray) -> float:
-    """Share of the scan that lies on the other; the larger of the two shares."""
+    """The share of one scan that lies on the other, whichever of the two shares is larger."""
     reach = _REACH * max(first.spacing, second.spacing)
     shares = []
     for one, other, motion in (

@@ -1,4 +1,4 @@
-"""Where two scans touch: closest points, the planes there, and what they say of a motion."""
+"""Contact of two scans: their closest points, the planes there, and the information they give."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from jaxtyping import Float
 from cfr_jax.geometry import motions
 from cfr_jax.multiway.scans import Scan
 
-# Noise that no count of points averages away, as a share of the spacing: scans are not rigid
-# copies of one surface, and the points of one do not lie on those of the other.
+# Noise that does not average away however many points there are, as a share of the spacing. Scans
+# are not rigid copies of one surface, and the points of one do not lie on those of the other.
 _FLOOR = 0.25
-_LEAST_SPREAD = 0.05  # of the spacing: exact copies have no residuals, and still are not certain
-_AGREEING = 0.5  # cosine between two normals of one surface; their signs may differ
-# What chance alone holds, in standard deviations: less than this says nothing of a direction.
+_LEAST_SPREAD = 0.05  # share of the spacing: even exact copies, without residuals, are not certain
+_AGREEING = 0.5  # least cosine between two normals of one surface; their signs may differ
+# A direction is determined only by information of more than this many standard deviations of what
+# noise in the normals makes by chance.
 _CHANCE = 4.0
 
 
@@ -24,16 +25,16 @@ class Contact:
     """Pairs of closest points of two scans, after a motion of the source onto the target."""
 
     rows: Float[np.ndarray, "k 6"]
-    """How the distance to the plane changes with a twist d of the source, in the source's frame:
-    the motion becomes transform @ exp(d)."""
+    """The derivative of each distance to the plane by a twist d of the source, in the source's
+    frame. The twist makes the motion transform @ exp(d)."""
     target_rows: Float[np.ndarray, "k 6"]
-    """The same for a twist of the target, in the target's frame."""
+    """The same derivative by a twist of the target, in the target's frame."""
     source_rows: Float[np.ndarray, "k 6"]
-    """As `rows`, with the normals of the source's own planes."""
+    """Like `rows`, but with the source's own normals."""
     heights: Float[np.ndarray, " k"]
-    """Signed distances of the source's points to the planes of the target's."""
+    """The signed distances from the source's points to the planes at their target points."""
     share: float
-    """How much of the source's points are among the pairs."""
+    """The share of the source's points that are in a pair."""
 
 
 def touching(
@@ -43,7 +44,7 @@ def touching(
     reach: float,
     most: int,
 ) -> Contact:
-    """Pairs closer than `reach`, with normals that agree, of the first `most` source points."""
+    """The pairs closer than `reach` whose normals agree, among the first `most` source points."""
     points, normals = source.points[:most], source.normals[:most]
     moved = motions.apply(transform, points)
     distance, index = target.tree.query(moved, distance_upper_bound=reach)
@@ -69,10 +70,10 @@ def information(
 ) -> tuple[Float[np.ndarray, "6 6"], float]:
     """The information matrix of a motion (see `graph.Edges`), and the RMS distance to the planes.
 
-    It is that of point-to-plane least squares, with a floor under the variances. A direction that
-    no plane holds (along a corridor, about an axis) is as uncertain as the scan is large. Noise in
-    the normals would hide that: so each pair of points counts with the normals of both scans, whose
-    noise has nothing in common, and what is left is compared with chance.
+    It is the matrix of point-to-plane least squares, with a lower bound on the variances. If no
+    plane constrains a direction (along a corridor, about an axis), the uncertainty in it is the
+    size of the scan. Noise in the normals would hide this. So each pair of points uses the normals
+    of both scans, whose noise is independent, and the result is compared with what chance makes.
     """
     found = touching(source, target, transform, reach, most)
     spacing = max(source.spacing, target.spacing)
@@ -81,7 +82,7 @@ def information(
     size = np.array([arm, arm, arm, 1.0, 1.0, 1.0])
     if not count:
         return np.diag((size / arm) ** 2), float("inf")
-    # the median absolute deviation of normal noise, times this, is its standard deviation
+    # 1.4826 times the median absolute deviation of Gaussian noise is its standard deviation
     spread = 1.4826 * float(np.median(np.abs(found.heights)))
     spread = max(spread, _LEAST_SPREAD * spacing)
     first, second = found.rows / size, found.source_rows / size

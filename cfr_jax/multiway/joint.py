@@ -1,8 +1,8 @@
-"""Joint refinement: all poses moved at once, until all overlapping scans lie on each other.
+"""Joint refinement: moves all poses at once until all overlapping scans fit each other.
 
-Multi-view point-to-plane registration (Chen & Medioni, 1991; Pulli, 1999): a pose graph makes the
-errors of pairs agree, but only the surfaces themselves say where the scans lie. Each pair counts in
-both directions, robustly, by the noise of its own distances.
+This is multi-view point-to-plane registration (Chen & Medioni, 1991; Pulli, 1999). A pose graph
+only spreads the errors of the pairs, but the surfaces themselves say where the scans lie. Each pair
+counts in both directions, with robust weights that depend on the noise of its own distances.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ from cfr_jax.geometry import twists
 from cfr_jax.multiway.contact import touching
 from cfr_jax.multiway.scans import Scan
 
-_REACHES = (3.0, 1.5)  # in spacings: how far apart two points may be and count as a pair
-_STEPS = (6, 6)
-_POINTS = 1200  # of each scan in each pair
-_DAMPING = 1e-4  # of the mean curvature: holds what no plane holds where the pose graph put it
-_SETTLED = 1e-3  # of the spacing: the largest move of a scan's points that is no move
+_REACHES = (3.0, 1.5)  # largest distance of two points that form a pair, in spacings, per stage
+_STEPS = (6, 6)  # most steps in each stage
+_POINTS = 1200  # source points used in each pair of scans
+# Share of the mean curvature. Damping keeps scans where the pose graph put them, along directions
+# that no plane constrains.
+_DAMPING = 1e-4
+_SETTLED = 1e-3  # share of the spacing: a stage ends when no point moves by more than this
 
 
 def refine(
@@ -31,9 +33,10 @@ def refine(
     pairs: Int[np.ndarray, "p 2"],
     fixed: Bool[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 4 4"]:
-    """The refined poses; `pairs` are rows of scans that overlap. Those that are `fixed` stay.
+    """Refines the poses. `pairs` are rows of scans that overlap. Scans that are `fixed` do not
+    move.
 
-    If the scans do not lie better on each other in the end, the poses remain as they were.
+    If the scans do not fit better in the end, the poses are returned unchanged.
     """
     if not len(pairs) or fixed.all():
         return poses
@@ -82,7 +85,7 @@ def _equations(
         if not len(heights):
             continue
         spread = max(1.4826 * float(np.median(np.abs(heights))), 0.02 * source.spacing)
-        # Geman & McClure: far planes belong to something else, and count less and less
+        # Geman & McClure's weights: the farther a plane, the more likely it is another surface
         weight = 1 / (spread * (1 + (heights / (3 * spread)) ** 2)) ** 2
         sides = [
             (place[scan], rows)

@@ -1,11 +1,11 @@
-"""Poses in files: what other programs write, as guesses; what they read, as answers.
+"""Reads poses from files of other programs, to start from, and writes poses for other programs.
 
-A pose maps a scan into the model's frame. Formats, by suffix or name:
+A pose maps a scan into the model's frame. The suffix or the name of a file gives its format:
 
-- `.json`: {"poses": {name: 4x4}}, as `cfr merge` writes it with much else
-- `.txt`, `.kitti`: KITTI, the first three rows of the matrix, a line for each scan in order
+- `.json`: {"poses": {name: 4x4}}, as `cfr merge` writes it, together with much else
+- `.txt`, `.kitti`: KITTI, the first three rows of the matrix, with a line for each scan in order
 - `.tum`: TUM, `time x y z qx qy qz qw`; the time is the number of the scan, from 0
-- `images.txt`: COLMAP, `id qw qx qy qz x y z camera name`, of the inverse pose, every other line
+- `images.txt`: COLMAP, `id qw qx qy qz x y z camera name` for the inverse pose, on every other line
 - `.conf`: the Stanford repository, `bmesh name x y z qx qy qz qw`
 """
 
@@ -29,19 +29,20 @@ Poses = Mapping[str, Float[np.ndarray, "4 4"]]
 
 
 def read_poses(path: Path, names: Sequence[str]) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """The poses in a file, of those scans that have one, by name.
+    """Reads the poses in a file, by the name of the scan. Scans without a pose are left out.
 
-    Files without names are in the order of `names`. Text is told by its columns. Raises ValueError,
-    with the file and line, for what holds no poses, or none of these scans.
+    In formats without names, lines are in the order of `names`. In a text file, the number of
+    columns tells the format. Raises ValueError, with the file and line, if the file has no poses,
+    or none of these scans.
     """
     try:
         if path.stat().st_size > _LARGEST_FILE:
-            raise ValueError("is too large for poses")
+            raise ValueError("the file is too large for poses")
         text = path.read_text("utf-8-sig")
         found = _parsed(path, text, names)
         known = {name: pose for name, pose in found.items() if name in names}
         if not known:
-            raise ValueError(f"names none of the scans ({', '.join(list(found)[:3])} …)")
+            raise ValueError(f"it has none of the scans ({', '.join(list(found)[:3])} …)")
         return {name: motions.check_rigid(name, pose) for name, pose in known.items()}
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
@@ -50,10 +51,10 @@ def read_poses(path: Path, names: Sequence[str]) -> dict[str, Float[np.ndarray, 
 
 
 def write_poses(path: Path, poses: Poses, names: Sequence[str]) -> None:
-    """Writes the poses of scans, in the order of `names`, in the format that the name asks for.
+    """Writes the poses of scans, in the order of `names`, in the format of the file's name.
 
-    KITTI has no names: scans without a pose have no line there. JSON with all else that is known
-    is written by `cfr merge`.
+    KITTI files have no names, so a scan without a pose simply has no line in them. The JSON written
+    here has only the poses; `cfr merge` writes a JSON file with everything else that is known.
     """
     held = [(names.index(name), name, poses[name]) for name in names if name in poses]
     suffix = path.suffix.lower()
@@ -87,10 +88,10 @@ def _parsed(path: Path, text: str, names: Sequence[str]) -> dict[str, np.ndarray
     for order, (number, cells) in enumerate(rows):
         values = _numbers(number, cells, (8, 12))
         tum = len(values) == 8
-        # TUM's time is the number of a scan where all times are; else lines are in order
+        # in TUM, the time is the number of a scan if all times can be; otherwise lines are in order
         index = int(values[0]) if tum and _counting(rows, len(names)) else order
         if index >= len(names):
-            raise ValueError(f"line {number} is of scan {index}, there are {len(names)}")
+            raise ValueError(f"line {number} is for scan {index}, but there are only {len(names)}")
         made[names[index]] = _pose(values[1:4], values[4:]) if tum else _matrix(values)
     return made
 
@@ -127,7 +128,7 @@ def _pose(place: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
 
 def _from_conf(number: int, cells: list[str]) -> tuple[str, np.ndarray]:
     *place, x, y, z, w = _numbers(number, cells[2:], (7,))
-    # The repository's programs turn by the inverse of what the quaternion means elsewhere.
+    # The repository's programs use the inverse of the rotation that the quaternion means elsewhere.
     return cells[1], _pose(place, (-x, -y, -z, w))
 
 

@@ -1,6 +1,6 @@
-"""Pairs of scans registered by `align_many`, each only once: what is in the journal is not redone.
+"""Registers pairs of scans with `align_many`, each only once: pairs in the journal are not redone.
 
-A target that many scans share is encoded once: `choosing` orders the pairs so.
+A target that many scans share is encoded once, because `choosing` orders the pairs by target.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from cfr_jax.runtime.progress import Progress
 
 Record = dict[str, Any]
 NEAR, CLOSURE, ANYWHERE = range(3)
-"""Which try of two scans it is: from where they lie, from where the poses lay them, or from all
-rotations. It tells the records of two scans apart."""
+"""The kind of start: where the scans lie, where the poses put them, or all rotations. Two scans may
+have one record of each kind."""
 
 
 @runtime_checkable
 class Kept(Protocol):
-    """Where records are kept: `batch.journal.Journal` is one."""
+    """A store of records, such as `batch.journal.Journal`."""
 
     def __contains__(self, key: tuple[str, str, int]) -> bool: ...
 
     def __getitem__(self, key: tuple[str, str, int]) -> Record: ...
 
     def write(self, record: Record) -> None:
-        """Keeps a record."""
+        """Stores a record."""
 
 
 class Memory(dict[tuple[str, str, int], Record]):
-    """Records that are kept as long as the program runs."""
+    """A store of records in memory, which lasts as long as the program runs."""
 
     def write(self, record: Record) -> None:
-        """Keeps a record."""
+        """Stores a record."""
         self[record["source"], record["target"], record["repeat"]] = record
 
 
 class Registrar:
-    """Registers pairs of scans, and knows those that are done."""
+    """Registers pairs of scans, and skips those that are already done."""
 
     def __init__(
         self, scans: Mapping[int, Scan], kept: Kept, options: dict[str, Any], *, progress: bool
@@ -52,7 +52,7 @@ class Registrar:
         self._options, self._progress = options, progress
 
     def records(self, tries: Sequence[Try], kind: int) -> list[Record]:
-        """The record of each pair, in order."""
+        """Returns the record of each pair, in order. Registers the pairs that have none yet."""
         jobs = [self._job(pair, kind) for pair in tries]
         left = [row for row, job in enumerate(jobs) if self._found(job, tries[row]) is None]
         if left:
@@ -76,7 +76,7 @@ class Registrar:
         return (self._searched(row, each) for row, each in enumerate(tries))
 
     def _searched(self, row: int, pair: Try) -> Outcome:
-        """The answer of a search of all rotations, which takes one pair at a time."""
+        """The answer of a search over all rotations, which works on one pair at a time."""
         options = {name: value for name, value in self._options.items() if name not in _OF_BATCHES}
         try:
             found = align(*self._pair(pair)[:2], initial="global", **options)
@@ -96,7 +96,7 @@ class Registrar:
         return [self._scans[pair.source].digest, self._scans[pair.target].digest]
 
     def _found(self, job: Job, pair: Try) -> Record | None:
-        """The record of a pair that is done, unless one of its files has changed since."""
+        """The record of a pair, or None if it is not done or one of its files has changed since."""
         record = self._kept[job.key] if job.key in self._kept else None
         return record if record and record.get("digests") == self._digests(pair) else None
 

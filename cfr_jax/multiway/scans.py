@@ -1,7 +1,7 @@
-"""Scans as this room keeps them: few points, centered, with normals and a tree.
+"""Scans in memory: a few thousand points each, centered, with normals and a KD-tree.
 
-A thousand scans fit in memory, because of each only some thousand points are kept. All points are
-read again where the merged cloud is made.
+A thousand scans fit in memory, because only a few thousand points of each are kept. All points are
+read again when the merged cloud is made.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from cfr_jax.data.scans import estimate_normals
 from cfr_jax.geometry import units
 from cfr_jax.io import PointCloud, as_point_cloud
 
-KEPT = 8192  # points of a scan that are kept; the network sees 1,024 of them
-_NEIGHBORS = 16  # of a normal
-# Scans of one thing differ less in radius; millimeters among meters differ more.
+KEPT = 8192  # points that are kept of each scan; the network sees 1,024 of them
+_NEIGHBORS = 16  # points that a normal is estimated from
+# Scans of one thing differ in radius by less than this factor; millimeters and meters by more.
 _SIZES_APART = 20.0
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A scan, thinned."""
+    """A thinned scan."""
 
     index: int
     """Its place in the input."""
@@ -41,30 +41,31 @@ class Scan:
     center: Float[np.ndarray, " 3"]
     radius: float
     digest: str
-    """Of all its points: equal for scans that are the same."""
+    """A hash of all its points, which is equal for scans with the same points."""
     total: int
-    """How many points it has unthinned."""
+    """The number of its points before thinning."""
 
     @functools.cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
-        """Relative to the center, in random order: the first of them are a fair choice."""
+        """The kept points relative to the center, in random order, so that the first few are a
+        random sample."""
         return self.cloud.points[self._order] - self.center
 
     @functools.cached_property
     def normals(self) -> Float[np.ndarray, "n 3"]:
-        """Unit normals of `points`."""
+        """The unit normals of `points`."""
         if self.cloud.normals is not None:
             return self.cloud.normals[self._order]
         return estimate_normals(self.points, math.inf, _NEIGHBORS)
 
     @functools.cached_property
     def tree(self) -> cKDTree:
-        """Of `points`."""
+        """The KD-tree of `points`."""
         return cKDTree(self.points)
 
     @functools.cached_property
     def spacing(self) -> float:
-        """Median distance of a point to its nearest neighbor."""
+        """The median distance from a point to its nearest neighbor."""
         return float(np.median(self.tree.query(self.points[:1000], k=2)[0][:, 1]))
 
     @property
@@ -82,14 +83,14 @@ class LeftOut:
 
 
 def name_of(cloud: Any, index: int) -> str:
-    """What to call an input: the name of a file or cloud, or its number."""
+    """The name of an input: the name of its file or cloud, or else its number."""
     if isinstance(cloud, (str, os.PathLike)):
         return Path(cloud).name
     return cloud.name if isinstance(cloud, PointCloud) else f"scan {index}"
 
 
 def names_of(clouds: Sequence[Any]) -> tuple[str, ...]:
-    """A name for each input, all different: files of one name get their folders' names, too."""
+    """A unique name for each input. Files with the same name are called by their paths."""
     names = [name_of(cloud, index) for index, cloud in enumerate(clouds)]
     for index, cloud in enumerate(clouds):
         if names.count(name_of(cloud, index)) > 1:
@@ -101,7 +102,8 @@ def names_of(clouds: Sequence[Any]) -> tuple[str, ...]:
 
 
 def load(clouds: Sequence[Any], names: Sequence[str], *, seed: int) -> Iterator[Scan | LeftOut]:
-    """Each input as a scan, or why it cannot be one. A file is read and let go."""
+    """Yields each input as a scan, or the reason why it cannot be one. Only the thinned points of a
+    file stay in memory."""
     for index, (given, name) in enumerate(zip(clouds, names, strict=True)):
         try:
             cloud = as_point_cloud(given, name=name)
@@ -125,7 +127,7 @@ def load(clouds: Sequence[Any], names: Sequence[str], *, seed: int) -> Iterator[
 
 
 def of_other_sizes(scans: Sequence[Scan]) -> list[LeftOut]:
-    """Scans so much larger or smaller than most that they must be in another unit."""
+    """The scans that are so much larger or smaller than most that their unit must be another."""
     if len(scans) < 3:
         return []
     usual = float(np.median([scan.radius for scan in scans]))
@@ -133,7 +135,7 @@ def of_other_sizes(scans: Sequence[Scan]) -> list[LeftOut]:
         LeftOut(
             scan.index,
             scan.name,
-            f"its radius is {scan.radius:.3g}, that of most scans is {usual:.3g}: same units?",
+            f"its radius is {scan.radius:.3g}, but that of most scans is {usual:.3g}: same units?",
         )
         for scan in scans
         if not usual / _SIZES_APART < scan.radius < usual * _SIZES_APART
@@ -141,7 +143,8 @@ def of_other_sizes(scans: Sequence[Scan]) -> list[LeftOut]:
 
 
 def twins(scans: Sequence[Scan]) -> dict[int, int]:
-    """Scans with exactly the points of an earlier one, by index, and that one's index."""
+    """Scans with exactly the same points as an earlier one: their index, with the index of the
+    earlier one."""
     first: dict[str, int] = {}
     found = {}
     for scan in scans:
