@@ -1,4 +1,4 @@
-"""The merged cloud: means of cubes, and which scan a point came from."""
+"""The merged cloud: the mean point of each cube, and the scan that a point came from."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cfr_jax.multiway import fusing
 
 
 def shown(points: np.ndarray, pose: np.ndarray, normals: np.ndarray | None = None) -> io.PointCloud:
-    """Points of the model, as a scan with this pose has them."""
+    """Points of the model, in the frame of a scan with this pose."""
     back = motions.inverse(pose)
     return io.PointCloud(
         motions.apply(back, points), None if normals is None else motions.rotate(back, normals)

@@ -1,4 +1,5 @@
-"""Pose graphs: known poses recovered from noisy edges, the Jacobian, what the covariance says."""
+"""Pose graphs: known poses are recovered from noisy edges; the Jacobian and covariances are
+right."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Joint refinement: scans of a known surface, moved off their places, come back."""
+"""Joint refinement brings scans of a known surface back to their places."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_the_slopes_of_a_contact_are_those_of_finite_differences(solid):
     between = motions.inverse(poses[1]) @ poses[0]
     found = contact.touching(source, target, between, 0.1, 300)
     planes = found.target_rows[:, 3:]
-    # when: pairs stay what they are
+    # when: the pairs do not change
     partners = heights_at(source, target, between, planes, np.zeros(6), np.zeros(6), 0.1)
     size = 1e-6
     for row in range(6):
@@ -47,8 +47,8 @@ def test_the_slopes_of_a_contact_are_those_of_finite_differences(solid):
 
 
 def heights_at(source, target, between, planes, own, theirs, reach):
-    """Distances to the planes of the pairs at `between`, after a twist of the source and one of the
-    target; written anew, point by point."""
+    """The distances to the planes of the pairs at `between`, after a twist of the source and one of
+    the target. This oracle computes them point by point."""
     made = []
     row = 0
     for point, normal in zip(source.points[:300], source.normals[:300], strict=True):

@@ -1,4 +1,5 @@
-"""`merge`: scans with known poses; what is left out and why; nothing registered twice."""
+"""`merge` on scans with known poses: which scans it leaves out and why, and that it registers
+nothing twice."""
 
 from __future__ import annotations
 
@@ -23,13 +24,13 @@ def views():
 
 @pytest.fixture(scope="module")
 def kept():
-    """All pairs that the tests of this file register."""
+    """A store of all pairs that the tests in this file register."""
     return Memory()
 
 
 @pytest.fixture(scope="module")
 def merged(views, kept, tmp_path_factory):
-    """Five scans, and what a folder of scans may also hold."""
+    """Five scans, and other inputs that a folder of scans may contain."""
     clouds, _ = views
     empty = tmp_path_factory.mktemp("scans") / "empty.ply"
     empty.write_bytes(b"")
@@ -103,7 +104,7 @@ def test_the_covariance_is_about_as_large_as_the_errors(merged, views):
 
 
 def test_nothing_is_registered_twice(views, kept, merged, monkeypatch):
-    # given: all pairs are there
+    # given: all pairs are registered already
     def never(*_, **__):
         raise AssertionError("registered again")
 

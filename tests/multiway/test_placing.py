@@ -1,4 +1,4 @@
-"""Wrong edges found, components kept apart, cycles of three."""
+"""Wrong edges are found, components stay separate, and cycles of three confirm edges."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cfr_jax.multiway.pose_graph.graph import Edges
 
 
 def together(first: Edges, second: Edges, shift: int) -> Edges:
-    """Two graphs side by side, the second one's scans counted from `shift`."""
+    """Two graphs in one, where the scans of the second are numbered from `shift`."""
     return Edges(
         np.concatenate([first.source, second.source + shift]),
         np.concatenate([first.target, second.target + shift]),
@@ -47,7 +47,7 @@ def test_the_noise_around_a_cycle_is_that_of_its_edges():
         poses = some_poses(3, seed=seed)
         edges = graph_of(poses, noise=0.02, seed=seed, ahead=1)
         squares.append(bool(cycles.closed(edges, cycles.triangles(edges))[0]))
-    # then: all within one in ten thousand
+    # then: nearly all cycles close, as the limit rejects only one in ten thousand
     assert np.mean(squares) > 0.99
 
 
@@ -97,7 +97,7 @@ def test_two_things_become_two_components_the_larger_first():
 
 
 def test_a_single_edge_places_a_scan_only_where_it_is_sure_and_may_count_alone():
-    # given: a ring, and one more scan that hangs on one edge
+    # given: a ring, and one more scan that a single edge connects
     ring = some_poses(5, seed=3)
     edges = together(
         graph_of(ring, noise=0.01, ahead=2), graph_of(ring[:2], noise=0.01, ahead=1, ring=False), 4
@@ -117,7 +117,7 @@ def test_a_single_edge_places_a_scan_only_where_it_is_sure_and_may_count_alone()
 
 
 def test_a_thing_that_fits_in_two_ways_shows_in_its_edges():
-    # given: a shape that a half turn hardly changes; some edges are turned so, and agree
+    # given: a shape that a half turn hardly changes; some edges have this turn, and agree on it
     poses = some_poses(8, seed=2)
     edges = graph_of(poses, noise=0.01)
     turned = np.arange(0, len(edges), 3)
@@ -138,7 +138,7 @@ def test_a_thing_that_fits_in_two_ways_shows_in_its_edges():
 
 
 def test_two_unsure_edges_that_agree_put_two_parts_together():
-    # given: two rings of one thing, with two edges between them, which are in no cycle of three
+    # given: two rings of one thing; two edges between them are in no cycle of three
     poses = some_poses(10, seed=6)
     rings = together(
         graph_of(poses[:5], noise=0.01, ahead=2), graph_of(poses[5:], noise=0.01, ahead=2), 5

@@ -1,4 +1,4 @@
-"""Poses in files of other programs, against their own definitions."""
+"""Poses in the file formats of other programs, tested against the definitions of these formats."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_colmap_maps_the_model_into_the_camera(tmp_path):
 
 
 def test_the_bunny_s_conf_turns_the_other_way(tmp_path):
-    # given: a line of the repository's own file; the scan is from 45 degrees further
+    # given: a line from the repository's own file, for a scan taken 45 degrees further
     (tmp_path / "bun.conf").write_text(
         "camera -0.0172 -0.0936 -0.734 -0.0461723 0.970603 -0.235889 0.0124573\n"
         "bmesh bun000.ply 0 0 0 0 0 0 1\n"
