@@ -64,7 +64,7 @@ def warnings_of(
             "nothing is known about how likely the answer is right"
         )
     elif probability < TRUSTED:
-        hint = "" if searched else '; clouds turned far need initial="global" (--global)'
+        hint = "" if searched else '; if the clouds are turned far, try initial="global" (--global)'
         warnings.append(
             f"not to be trusted: confidence {probability:.2f}, "
             f"{fitness:.0%} of the source lies on the target{hint}"
@@ -88,6 +88,7 @@ def probability(
 
     A calibration is fitted to clouds of hundreds of points that meet, without rivals, and does not
     hold for others. So the probability is at most
+
     - the fitness, if the clouds hardly meet;
     - 1 / (1 + r) with r `rivals`, because each of them is as likely right as the answer;
     - 1 - exp(-n / 30) with n `inliers` (points of the source that lie on the target), because a few
