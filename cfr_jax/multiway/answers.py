@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from cfr_jax.multiway.fusing import Fused
+from cfr_jax.io import PointCloud
 from cfr_jax.multiway.scans import LeftOut
 
 
@@ -33,6 +33,24 @@ class Edge:
     poses. NaN between scans of different components, and where they do not touch."""
     reason: str
     """Why it is not kept; empty if it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """A merged cloud."""
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    """Unit normals: the mean of the scans' own, or estimated, pointing away from the centroid."""
+    scan: Int[np.ndarray, " n"]
+    """Index of the scan that gave most to each point."""
+    count: Int[np.ndarray, " n"]
+    """How many points each is the mean of."""
+    voxel: float
+
+    def as_cloud(self, name: str = "model") -> PointCloud:
+        """Points and normals, as `io.write` takes them."""
+        return PointCloud(self.points, self.normals, name)
 
 
 @dataclass(frozen=True, eq=False)

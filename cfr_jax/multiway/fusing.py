@@ -6,37 +6,22 @@ Memory holds one scan and what has been fused so far; the scans are read again o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from cfr_jax.data.scans import estimate_normals
 from cfr_jax.geometry import motions
-from cfr_jax.io import PointCloud
+from cfr_jax.io import PointCloud, as_point_cloud
+from cfr_jax.multiway.answers import Fused, Merged
+from cfr_jax.runtime.progress import Progress
 
 _NEIGHBORS = 16  # of a normal, where the scans bring none
 _COMPACTED = 1 << 22  # rows that may wait before cubes of several scans are put together
 _MOST_CELLS = 1 << 20  # along an axis: what fits three times in 63 bits
-
-
-@dataclass(frozen=True, eq=False)
-class Fused:
-    """A merged cloud."""
-
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    """Unit normals: the mean of the scans' own, or estimated, pointing away from the centroid."""
-    scan: Int[np.ndarray, " n"]
-    """Index of the scan that gave most to each point."""
-    count: Int[np.ndarray, " n"]
-    """How many points each is the mean of."""
-    voxel: float
-
-    def as_cloud(self, name: str = "model") -> PointCloud:
-        """Points and normals, as `io.write` takes them."""
-        return PointCloud(self.points, self.normals, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +34,29 @@ class _Cubes:
     most: Int[np.ndarray, " n"]
     """How many came from `scan`, which gave most."""
     scan: Int[np.ndarray, " n"]
+
+
+def fuse_models(
+    clouds: Sequence[Any], found: Merged, copies: Mapping[int, int], voxel: float, progress: bool
+) -> tuple[Fused, ...]:
+    """The merged cloud of each component. `clouds` are the caller's, read once more; `copies` came
+    twice, and count once."""
+    models = []
+    with Progress(
+        total=len(found.placed), desc="fusing", unit=" scans", disable=not progress
+    ) as bar:
+
+        def members(rows: np.ndarray) -> Iterator[tuple[int, PointCloud, np.ndarray]]:
+            for row in rows:
+                index = int(found.placed[row])
+                if index not in copies:  # the same points again would count twice
+                    cloud = as_point_cloud(clouds[index], name=found.names[index])
+                    yield index, cloud, found.poses[row]
+                bar.update()
+
+        for _, rows in found.by_component():
+            models.append(fuse(members(rows), voxel))
+    return tuple(models)
 
 
 def fuse(placed: Iterable[tuple[int, PointCloud, Float[np.ndarray, "4 4"]]], voxel: float) -> Fused:

@@ -68,6 +68,11 @@ class Scan:
         return float(np.median(self.tree.query(self.points[:1000], k=2)[0][:, 1]))
 
     @property
+    def full_spacing(self) -> float:
+        """About that distance among all of its points, not only the thinned ones, on a surface."""
+        return self.spacing * float(np.sqrt(len(self.cloud) / self.total))
+
+    @property
     def _order(self) -> np.ndarray:
         return np.random.default_rng(0).permutation(len(self.cloud))
 
