@@ -19,8 +19,8 @@ import numpy as np
 from device_profile import profile
 from train_step import ellipsoids, start
 
-from cfr_jax.data.augment import Sampling
-from cfr_jax.data.device_pairs import Shapes, draw_pairs
+from cfr_jax.data.augmentation.pairs_on_device import Shapes, draw_pairs
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.networks.cfr.iterations import unroll
 from cfr_jax.networks.inputs import Settings
 from cfr_jax.training import devices, optimizers, step

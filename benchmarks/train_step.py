@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.loader import batch_at
 from cfr_jax.data.sources import ShapeSource

@@ -38,7 +38,7 @@ class Register(beam.DoFn):
     def process(self, bundle: list[Job]) -> Iterator[str]:
         """Registers the pairs of one bundle."""
         from cfr_jax import align_many
-        from cfr_jax.batch.journal import line_of
+        from cfr_jax.batch.checked_lines import line_of
         from cfr_jax.batch.records import as_record
 
         pairs = [job.pair for job in bundle]

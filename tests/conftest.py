@@ -28,7 +28,7 @@ def pytest_sessionstart():
     # The fields of a result state the shapes of one pair. Coming out of vmap or a scan it is made
     # anew, with one more axis in front or with placeholders, and that is no mistake.
     from cfr_jax.alignment import case, confidence, quality, solving
-    from cfr_jax.data.device_pairs import Shapes
+    from cfr_jax.data.augmentation.pairs_on_device import Shapes
     from cfr_jax.networks import sinkhorn
     from cfr_jax.networks.cfr import registration
     from cfr_jax.networks.clues import NetworkClues

@@ -8,29 +8,16 @@ first line says what the answers were made with. In memory is only where each li
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import json
 import os
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from cfr_jax.runtime.reading import irregular, opened, parse_json
+from cfr_jax.batch.checked_lines import line_of, record_at, records_in
+from cfr_jax.runtime.reading import irregular, opened
 from cfr_jax.runtime.words import Refused, shown
 
 Key = tuple[str, str, int]
-_CHECK = 16  # hexadecimal digits
-_END = re.compile(rb', "check": "([0-9a-f]{%d})"}\n' % _CHECK)
-_END_SIZE = len(', "check": ""}\n') + _CHECK
-_LONGEST_LINE = 1 << 26  # bytes; a record has a few thousand
-
-
-def line_of(value: dict[str, Any]) -> bytes:
-    """A record as a line of a journal. Its last member, `check`, is the start of the SHA-256 of the
-    line without it."""
-    bare = json.dumps(value, allow_nan=False).encode()
-    return bare[:-1] + f', "check": "{_check(bare)}"}}\n'.encode()
 
 
 class Journal:
@@ -84,9 +71,8 @@ class Journal:
     def __getitem__(self, key: Key) -> dict[str, Any]:
         """The record of a pair that is done, read again; raises ValueError if it was changed."""
         path, start = self._places[key]
-        with _said(path), opened(path) as stream:
-            stream.seek(start)
-            return _record(stream.readline(_LONGEST_LINE), f"{shown(path)}, byte {start}")
+        with _said(path):
+            return record_at(path, start)
 
     def close(self) -> None:
         """Lets others open the file."""
@@ -96,7 +82,7 @@ class Journal:
     def adopt(self, path: Path, made_with: dict[str, Any]) -> None:
         """Also takes for done what another journal of the same settings holds."""
         with _said(path):
-            records = _records(path)
+            records = records_in(path)
             start, header = next(records, (0, {}))
         if header.get("format") != self._format or not isinstance(header.get("made_with"), dict):
             older = str(header.get("format")).startswith(f"cfr_jax/{self._command}/")
@@ -196,10 +182,6 @@ class Journal:
             return
 
 
-def _check(bare: bytes) -> str:
-    return hashlib.sha256(bare).hexdigest()[:_CHECK]
-
-
 @contextlib.contextmanager
 def _said(path: Path) -> Iterator[None]:
     """Within, a file that cannot be opened or read is named."""
@@ -210,47 +192,3 @@ def _said(path: Path) -> Iterator[None]:
     except Refused as error:
         told = str(error)
         raise (error if shown(path) in told else Refused(f"{shown(path)} {told}")) from error
-
-
-def _records(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Each record, the header first, with the byte where its line starts."""
-    with opened(path) as stream:
-        start, number = 0, 0
-        while line := stream.readline(_LONGEST_LINE):
-            if not line.endswith(b"\n") and len(line) < _LONGEST_LINE:
-                return  # still being written, by another shard
-            number += 1
-            try:
-                yield start, _record(line, f"{shown(path)}, line {number}", header=number == 1)
-            except Refused:
-                if number == 1:
-                    return
-                raise
-            start += len(line)
-
-
-def _record(line: bytes, where: str, header: bool = False) -> dict[str, Any]:
-    """The value of a line whose checksum fits."""
-    try:
-        end = _END.fullmatch(line[-_END_SIZE:])
-        if end is None or _check(line[:-_END_SIZE] + b"}").encode() != end[1]:
-            if header and line.startswith(b'{"format": "cfr_jax/batch/1"'):
-                return parse_json(line)  # of the version without checksums
-            raise Refused("its checksum does not fit")
-        record = parse_json(line)
-        if not header and not _is_record(record):
-            raise Refused("it is not a record of a pair")
-    except Refused as error:
-        raise Refused(
-            f"{where} is damaged ({error}): remove the line, and its pair is registered again"
-        ) from None
-    return record
-
-
-def _is_record(value: Any) -> bool:
-    return (
-        isinstance(value, dict)
-        and all(isinstance(value.get(name), str) for name in ("source", "target"))
-        and isinstance(value.get("repeat"), int)
-        and isinstance(value.get("error", 0), str | None)
-    )

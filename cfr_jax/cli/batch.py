@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cfr_jax.cli.shared import clouds, numbers, outputs
+from cfr_jax.cli.shared import clouds, flags, numbers, outputs, resuming
 from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.data import kinds
 
@@ -17,8 +16,6 @@ if TYPE_CHECKING:
     from cfr_jax.batch.jobs import Jobs
     from cfr_jax.batch.journal import Journal
     from cfr_jax.networks.record import Params
-
-UNTRUSTED = 3
 
 _DESCRIPTION = """\
 Registers many pairs. PAIRS is recognized by its layout, which is printed first:
@@ -71,50 +68,19 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--target", metavar="FILE", type=Path, help="the target of every cloud in a folder"
     )
-    parser.add_argument(
-        "--retry-failed", action="store_true", help="retry the pairs that failed before"
-    )
-    parser.add_argument(
-        "--shard",
-        metavar="I/N",
-        help="every N-th pair, from the I-th on; auto: ask the cluster, by jax.distributed",
-    )
-    parser.add_argument(
-        "--strict",
-        action="store_true",
-        help=f"exit with {UNTRUSTED} if a pair failed or is not to be trusted",
-    )
+    flags.add(parser, "--retry-failed", "--shard")
+    flags.add_strict(parser, "a pair failed or is not to be trusted")
     how = parser.add_argument_group("how to register")
     clouds.add_columns(how)
-    how.add_argument("--no-refine", action="store_true", help="take the network's own answers")
-    how.add_argument(
-        "--no-second-look", action="store_true", help="keep the first answers, even if in doubt"
-    )
-    how.add_argument("--weights", metavar="W", help="a shipped name, or a .safetensors file")
-    how.add_argument(
-        "--max-points", metavar="N", type=numbers.positive, help="most points of each cloud"
-    )
-    how.add_argument(
-        "--thinned",
-        action="store_true",
-        help="do not refine large clouds on all of their points at the end",
-    )
-    how.add_argument(
-        "--seed",
-        metavar="S",
-        type=numbers.not_negative,
-        default=0,
-        help="seed of the choice of points",
-    )
+    flags.add(how, "--no-refine", "--no-second-look", "--weights", "--max-points", "--thinned")
+    flags.add(how, "--seed")
     how.add_argument(
         "--batch-size",
         metavar="N",
         type=numbers.positive,
         help="pairs solved at once (default: 1 on a CPU, 16 on an accelerator)",
     )
-    how.add_argument(
-        "--workers", metavar="N", type=numbers.positive, help="threads that read ahead"
-    )
+    flags.add(how, "--workers")
 
 
 def _kinds() -> str:
@@ -134,12 +100,11 @@ def run(args: argparse.Namespace) -> int:
     clouds.columns_of(args)
 
     from cfr_jax.batch.jobs import jobs_of
-    from cfr_jax.cli.shared.shares import asked_share
     from cfr_jax.data.layout import recognize
 
     layout = recognize(args.pairs, args.layout)
     jobs, how = jobs_of(layout, args.target)
-    shard = asked_share(args.shard)
+    shard = resuming.asked_share(args.shard)
     print(f"recognized  {layout}")
     print(f"pairs       {len(jobs)}: {how}")
     out, rows = args.out, range(len(jobs))
@@ -147,39 +112,18 @@ def run(args: argparse.Namespace) -> int:
         rows, out = rows[shard.rows()], shard.beside(args.out)
         print(f"shard       {shard.number} of {shard.count}: {len(rows)} pairs")
 
-    from cfr_jax.batch.journal import Journal
-    from cfr_jax.batch.sharding import other_shards
     from cfr_jax.cli.shared.cache import keep_compiled_programs
-    from cfr_jax.weights.files import DEFAULT, read_weights
 
     keep_compiled_programs()
-    weights = read_weights(DEFAULT if args.weights is None else args.weights, "cfr")
-    made_with = {
-        "weights": weights.sha256,
-        "refine": not args.no_refine,
-        "second_look": not args.no_second_look,
-        "max_points": args.max_points,
-        "all_points": not args.thinned,
-        "seed": args.seed,
-        "columns": args.columns,
-    }
+    weights = flags.weights_of(args.weights)
+    made_with = {"weights": weights.sha256, **flags.solving(args), "columns": args.columns}
     kept = out.with_suffix(".jsonl")
     outputs.check_output("--out", kept)
-    with Journal(kept, made_with, retry=args.retry_failed) as journal:
-        for other in other_shards(kept) if shard is None else ():
-            journal.adopt(other, made_with)
+    with resuming.journal(kept, made_with, shard, args) as journal:
         left = array("Q", (row for row in rows if jobs.key(row) not in journal))
         if len(left) < len(rows):
             print(f"done before {len(rows) - len(left)}")
-        try:
-            _register(jobs, left, journal, weights.params, args)
-        except KeyboardInterrupt:
-            print(
-                f"cfr batch: stopped; {kept} keeps what is done\n"
-                "run the same command again to continue",
-                file=sys.stderr,
-            )
-            raise
+        _register(jobs, left, journal, weights.params, args)
         return _tell((journal[jobs.key(row)] for row in rows), out, kept, args.strict)
 
 
@@ -195,11 +139,7 @@ def _register(
     outcomes = align_many(
         clouds.with_columns((jobs[row].pair for row in left), args),
         params=params,
-        refine=not args.no_refine,
-        second_look=not args.no_second_look,
-        max_points=args.max_points,
-        all_points=not args.thinned,
-        seed=args.seed,
+        **flags.solving(args),
         batch=args.batch_size,
         workers=args.workers,
         ordered=False,
@@ -249,4 +189,4 @@ def _tell(records: Iterable[dict[str, Any]], out: Path, kept: Path, strict: bool
             f"none of the {count} pairs could be registered: {reasons[0][1]}\n"
             f"fix the files and add --retry-failed; every reason is in {out}"
         )
-    return UNTRUSTED if strict and trusted < count else 0
+    return flags.UNSURE if strict and trusted < count else 0

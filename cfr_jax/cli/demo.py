@@ -91,8 +91,8 @@ def _merge(folder: Path) -> int:
         outputs.check_output("--out", path)
 
     from cfr_jax import io, viewer
-    from cfr_jax.cli.merge import as_layers, as_text
     from cfr_jax.cli.shared.cache import keep_compiled_programs
+    from cfr_jax.cli.shared.merged import as_layers, as_text
     from cfr_jax.geometry import motions
     from cfr_jax.multiway.merging import merge
     from cfr_jax.multiway.pose_files import read_poses

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cfr_jax.cli.shared import outputs
+from cfr_jax.cli.shared import flags, outputs
 from cfr_jax.cli.shared.commands import Commands
 
 _DESCRIPTION = """\
@@ -60,20 +60,15 @@ def add_parser(commands: Commands) -> None:
         action="store_true",
         help="many pairs per call: adds a leading axis of any length",
     )
-    parser.add_argument(
-        "--weights",
-        metavar="W",
-        help="weights of the network: a name that ships with the package, or a .safetensors file",
-    )
+    flags.add(parser, "--weights")
 
 
 def run(args: argparse.Namespace) -> int:
     """Traces the program for each platform, and writes it."""
     outputs.check_output("--out", args.out, (".stablehlo",))
-    from cfr_jax.weights.files import DEFAULT, read_weights
     from cfr_jax.weights.stablehlo import export_register, save_exported
 
-    weights = read_weights(DEFAULT if args.weights is None else args.weights, "cfr")
+    weights = flags.weights_of(args.weights)
     platforms = [name.strip() for name in args.platforms.split(",")]
     exported = export_register(
         weights.params,

@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from cfr_jax import refine
-from cfr_jax.cli.shared import clouds, numbers, outputs
+from cfr_jax.cli.shared import clouds, flags, outputs
 from cfr_jax.cli.shared.commands import Commands
 from cfr_jax.runtime import optional
-
-UNTRUSTED = 3
 
 _DESCRIPTION = """\
 Finds the rigid motion that lays SOURCE on TARGET, and says how far to trust it.
@@ -91,11 +89,7 @@ def add_parser(commands: Commands) -> None:
     how = parser.add_argument_group("how to register")
     clouds.add_columns(how)
     after = how.add_mutually_exclusive_group()
-    after.add_argument(
-        "--no-refine",
-        action="store_true",
-        help="take the network's own answer, without the local refinement after it",
-    )
+    flags.add(after, "--no-refine")
     after.add_argument(
         "--refine",
         metavar="WAY",
@@ -104,11 +98,7 @@ def add_parser(commands: Commands) -> None:
         + "; ".join(f"{name}, {refine.refinement(name).title}" for name in refine.names())
         + f"; or module:function (default: {refine.DEFAULT})",
     )
-    how.add_argument(
-        "--weights",
-        metavar="W",
-        help="weights of the network: a name that ships with the package, or a .safetensors file",
-    )
+    flags.add(how, "--weights")
     where = how.add_mutually_exclusive_group()
     where.add_argument(
         "--initial",
@@ -129,36 +119,10 @@ def add_parser(commands: Commands) -> None:
         action="store_true",
         help="search all rotations only if the answer is not trusted without",
     )
-    how.add_argument(
-        "--max-points",
-        metavar="N",
-        type=numbers.positive,
-        help="most points of each cloud that the network sees; more are slower (default: chosen)",
-    )
-    how.add_argument(
-        "--thinned",
-        action="store_true",
-        help="stop at the points that the network sees; otherwise, larger clouds are refined on "
-        "all of their points at the end",
-    )
+    flags.add(how, "--max-points", "--thinned")
     how.add_argument("--all-points", action="store_true", help=argparse.SUPPRESS)  # what it was
-    how.add_argument(
-        "--no-second-look",
-        action="store_true",
-        help="keep the first answer; without this, one in doubt is tried again from other starts",
-    )
-    how.add_argument(
-        "--seed",
-        metavar="S",
-        type=numbers.not_negative,
-        default=0,
-        help="seed of the choice of points (default: 0); the same seed gives the same answer",
-    )
-    how.add_argument(
-        "--strict",
-        action="store_true",
-        help=f"exit with {UNTRUSTED} if the answer is not to be trusted; files are written anyway",
-    )
+    flags.add(how, "--no-second-look", "--seed")
+    flags.add_strict(how, "the answer is not to be trusted; files are written anyway")
 
 
 @clouds.telling("cfr register")
@@ -192,12 +156,8 @@ def run(args: argparse.Namespace) -> int:
         source,
         target,
         weights=args.weights,
-        refine=False if args.no_refine else args.refine,
         initial=initial,
-        max_points=args.max_points,
-        all_points=not args.thinned,
-        second_look=not args.no_second_look,
-        seed=args.seed,
+        **flags.solving(args, args.refine),
     )
     if args.out is not None:
         io.write(args.out, result.moved_source())
@@ -217,7 +177,7 @@ def run(args: argparse.Namespace) -> int:
         print(report.as_text(result))
         for path in filter(None, (args.out, args.json, args.view, args.png)):
             print(f"wrote       {path}")
-    return UNTRUSTED if args.strict and not result.alignment.trusted else 0
+    return flags.UNSURE if args.strict and not result.alignment.trusted else 0
 
 
 def _check_outputs(args: argparse.Namespace, to_stdout: bool) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from cfr_jax.data.pairs import Pair
-from cfr_jax.data.protocol import random_motion, resample
+from cfr_jax.data.perturbations import random_motion, resample
 from cfr_jax.data.scans import estimate_normals, refine_point_to_plane, voxel_mean
 from cfr_jax.geometry import motions
 from cfr_jax.runtime.atomic import unfinished

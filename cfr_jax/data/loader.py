@@ -15,7 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Int
 
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 
 
 @runtime_checkable
@@ -25,7 +25,7 @@ class Source(Protocol):
     def __len__(self) -> int: ...
 
     def draw(self, index: int, sampling: Sampling, rng: np.random.Generator) -> dict[str, Any]:
-        """A pair made from item `index`, in the format of `augment.finish_pair`."""
+        """A pair made from item `index`, in the format of `pairs_on_host.finish_pair`."""
         ...
 
 

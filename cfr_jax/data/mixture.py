@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from cfr_jax.data import kinds
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.kinds.kind import settings_of
 from cfr_jax.data.layout import recognize
 from cfr_jax.data.sources import TrainingSource

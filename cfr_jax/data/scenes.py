@@ -18,9 +18,10 @@ import numpy as np
 from jaxtyping import Float
 
 from cfr_jax import io
-from cfr_jax.data.augment import Sampling, View, choose_rows, finish_pair
+from cfr_jax.data.augmentation.pairs_on_host import View, choose_rows, finish_pair
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.pairs import Pair
-from cfr_jax.data.protocol import crop
+from cfr_jax.data.perturbations import crop
 from cfr_jax.geometry import units
 from cfr_jax.io import formats
 from cfr_jax.io.formats import by_suffix

@@ -12,8 +12,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from cfr_jax.data import protocol
-from cfr_jax.data.augment import Sampling, View, choose_rows, finish_pair, shared_count
+from cfr_jax.data import perturbations, protocol
+from cfr_jax.data.augmentation.pairs_on_host import View, choose_rows, finish_pair
+from cfr_jax.data.augmentation.sampling import Sampling, shared_count
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.loader import Source
 from cfr_jax.geometry.neighbors import nearest_on_host
@@ -57,7 +58,7 @@ class TrainingSource(Source, Protocol):
         radius: float,
         rng: np.random.Generator,
     ) -> dict[str, Any]:
-        """A validation pair from item `index`, in the format of `augment.finish_pair`."""
+        """A validation pair from item `index`, in the format of `pairs_on_host.finish_pair`."""
         ...
 
 
@@ -86,13 +87,13 @@ class ShapeSource:
         they are copied."""
         points, normals = self.corpus[index]
         if sampling.copied:
-            rows = protocol.resample(len(points), shared_count(sampling, len(points)), rng)
+            rows = perturbations.resample(len(points), shared_count(sampling, len(points)), rng)
             points, normals = points[rows], normals[rows]
         uneven = rng.random() < sampling.uneven
         views = []
         for _ in range(2):
             keep = rng.uniform(*sampling.keep)
-            kept = protocol.crop(points, keep, rng) if keep < 1 else np.arange(len(points))
+            kept = perturbations.crop(points, keep, rng) if keep < 1 else np.arange(len(points))
             rows = kept[choose_rows(points[kept], sampling, uneven, rng)]
             views.append(View(points[rows], normals[rows]))
         return finish_pair(views[0], views[1], np.eye(4), sampling, rng)

@@ -79,13 +79,9 @@ def chamfer(
     The clean clouds have no noise and no crop, and each is in the frame of its cloud. So a good
     estimate is not penalized for what the crop removed.
     """
-    clouds = [
-        _finite("source", source),
-        _finite("target", target),
-        _finite("clean_source", clean_source),
-        _finite("clean_target", clean_target),
-    ]
-    source, target, clean_source, clean_target = clouds
+    source, target = _finite("source", source), _finite("target", target)
+    clean_source = _finite("clean_source", clean_source)
+    clean_target = _finite("clean_target", clean_target)
     estimate = _finite("estimate", estimate)
     forward, _ = cKDTree(clean_target).query(motions.apply(estimate, source))
     backward, _ = cKDTree(motions.apply(estimate, clean_source)).query(target)

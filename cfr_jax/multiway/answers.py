@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from cfr_jax.multiway.fusing import Fused
+from cfr_jax.io import PointCloud
 from cfr_jax.multiway.scans import LeftOut
 
 
@@ -34,6 +34,26 @@ class Edge:
     poses. NaN between scans of different components, and if the scans do not touch."""
     reason: str
     """Why the edge is not kept; empty if it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """A merged cloud."""
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    """Unit normals: the mean of the scans' own normals, or estimated ones that point away from the
+    centroid."""
+    scan: Int[np.ndarray, " n"]
+    """For each point, the index of the scan that contributed the most to it."""
+    count: Int[np.ndarray, " n"]
+    """The number of points of which each point is the mean."""
+    voxel: float
+    """The edge length of the cubes."""
+
+    def as_cloud(self, name: str = "model") -> PointCloud:
+        """The points and normals as a cloud that `io.write` accepts."""
+        return PointCloud(self.points, self.normals, name)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,39 +6,22 @@ Memory holds one scan at a time and the cloud fused so far. The scans are read a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from cfr_jax.data.scans import estimate_normals
 from cfr_jax.geometry import motions
-from cfr_jax.io import PointCloud
+from cfr_jax.io import PointCloud, as_point_cloud
+from cfr_jax.multiway.answers import Fused, Merged
+from cfr_jax.runtime.progress import Progress
 
 _NEIGHBORS = 16  # points that a normal is estimated from if the scans have no normals
 _COMPACTED = 1 << 22  # rows that may wait before the cubes of several scans are summed
 _MOST_CELLS = 1 << 20  # cells along each axis; three such indices fit in 63 bits
-
-
-@dataclass(frozen=True, eq=False)
-class Fused:
-    """A merged cloud."""
-
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    """Unit normals: the mean of the scans' own normals, or estimated ones that point away from the
-    centroid."""
-    scan: Int[np.ndarray, " n"]
-    """For each point, the index of the scan that contributed the most to it."""
-    count: Int[np.ndarray, " n"]
-    """The number of points of which each point is the mean."""
-    voxel: float
-    """The edge length of the cubes."""
-
-    def as_cloud(self, name: str = "model") -> PointCloud:
-        """The points and normals as a cloud that `io.write` accepts."""
-        return PointCloud(self.points, self.normals, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +34,29 @@ class _Cubes:
     most: Int[np.ndarray, " n"]
     """The number of points from `scan`, the scan that contributed the most."""
     scan: Int[np.ndarray, " n"]
+
+
+def fuse_models(
+    clouds: Sequence[Any], found: Merged, copies: Mapping[int, int], voxel: float, progress: bool
+) -> tuple[Fused, ...]:
+    """The merged cloud of each component. The caller's `clouds` are read once more. The points of
+    scans in `copies` are not used, because they repeat those of another scan."""
+    models = []
+    with Progress(
+        total=len(found.placed), desc="fusing", unit=" scans", disable=not progress
+    ) as bar:
+
+        def members(rows: np.ndarray) -> Iterator[tuple[int, PointCloud, np.ndarray]]:
+            for row in rows:
+                index = int(found.placed[row])
+                if index not in copies:  # otherwise the same points would count twice
+                    cloud = as_point_cloud(clouds[index], name=found.names[index])
+                    yield index, cloud, found.poses[row]
+                bar.update()
+
+        for _, rows in found.by_component():
+            models.append(fuse(members(rows), voxel))
+    return tuple(models)
 
 
 def fuse(placed: Iterable[tuple[int, PointCloud, Float[np.ndarray, "4 4"]]], voxel: float) -> Fused:

@@ -4,37 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from jaxtyping import Float
 
 from cfr_jax.geometry import motions
-from cfr_jax.io import PointCloud, as_point_cloud
 from cfr_jax.multiway import choosing
-from cfr_jax.multiway.answers import Merged
-from cfr_jax.multiway.building import Build, build, refined
+from cfr_jax.multiway.answers import Fused, Merged
+from cfr_jax.multiway.building import build, refined
 from cfr_jax.multiway.choosing import Try
-from cfr_jax.multiway.fusing import Fused, fuse
-from cfr_jax.multiway.pose_graph.placing import SURE
-from cfr_jax.multiway.registering import (
-    ANYWHERE,
-    CLOSURE,
-    NEAR,
-    Kept,
-    Memory,
-    Record,
-    Registrar,
-)
+from cfr_jax.multiway.fusing import fuse_models
+from cfr_jax.multiway.registering import CLOSURE, NEAR, Kept, Memory, Options, Registrar
 from cfr_jax.multiway.reporting import answer
 from cfr_jax.multiway.scans import LeftOut, Scan, load, names_of, of_other_sizes, twins
+from cfr_jax.multiway.searching import closures, searched
 from cfr_jax.networks.record import Params
 from cfr_jax.runtime.progress import Progress
-
-_CLOSING = 4  # the number of other scans with which each scan may close loops
-_ENOUGH = 2  # after this many sure answers, the search for a scan ends
 
 
 def merge(
@@ -83,14 +71,14 @@ def merge(
     began = time.perf_counter()
     clouds = list(clouds)
     _check(clouds, guesses, reference, voxel)
-    options = {
+    options: Options = {
         "params": params,
         "max_points": max_points,
         "seed": seed,
         "batch": batch,
         "workers": workers,
     }
-    start = _start(clouds, options, sequence, guesses, Memory() if kept is None else kept, progress)
+    start = _start(clouds, sequence, guesses, Memory() if kept is None else kept, progress, options)
     usable, registrar, tries = start.scans, start.registrar, start.tries
     seconds = {"read": time.perf_counter() - began}
 
@@ -99,8 +87,8 @@ def merge(
     alone = sequence or len(usable) == 2
     built = build(usable, tries, records, alone=alone)
     if everywhere and built.placement.component.any():
-        tries, records, built = _search(usable, registrar, tries, records, alone)
-    if loop_closures and (more := _closures(usable, tries, built)):
+        tries, records, built = searched(usable, registrar, tries, records, alone)
+    if loop_closures and (more := closures(usable, tries, built)):
         records = records + registrar.records(more, CLOSURE)
         built = build(usable, tries + more, records, alone=alone)
     seconds["register"] = time.perf_counter() - started
@@ -111,7 +99,10 @@ def merge(
 
     started = time.perf_counter()
     found = answer(start.names, usable, built, covariances, start.left_out, start.copies, reference)
-    models = _fused(clouds, usable, found, start.copies, voxel, progress) if fused else ()
+    models: tuple[Fused, ...] = ()
+    if fused:
+        size = voxel or float(np.median([scan.full_spacing for scan in usable]))
+        models = fuse_models(clouds, found, start.copies, size, progress)
     seconds["fuse"] = time.perf_counter() - started
     seconds["total"] = time.perf_counter() - began
     return dataclasses.replace(found, clouds=models, seconds=seconds)
@@ -122,30 +113,20 @@ def register_share(
     rows: slice,
     *,
     kept: Kept,
-    params: Params | None = None,
     sequence: bool = False,
     guesses: Sequence[Float[np.ndarray, "4 4"] | None] | None = None,
-    max_points: int | None = None,
-    seed: int = 0,
-    batch: int | None = None,
-    workers: int | None = None,
     progress: bool = False,
+    **options: Unpack[Options],
 ) -> int:
     """Registers only a part of the pairs that `merge` registers first, and returns their number.
 
     `rows` selects this part of the pairs, as `batch.sharding.Shard.rows` does. The records are
-    stored in `kept`, so `merge` does not register these pairs again.
+    stored in `kept`, so `merge` does not register these pairs again. `options` are those of
+    `merge`, with the same defaults.
     """
     clouds = list(clouds)
     _check(clouds, guesses, None, None)
-    options = {
-        "params": params,
-        "max_points": max_points,
-        "seed": seed,
-        "batch": batch,
-        "workers": workers,
-    }
-    start = _start(clouds, options, sequence, guesses, kept, progress)
+    start = _start(clouds, sequence, guesses, kept, progress, options)
     return len(start.registrar.records(start.tries[rows], NEAR))
 
 
@@ -165,14 +146,14 @@ class _Start:
 
 def _start(
     clouds: list[Any],
-    options: dict[str, Any],
     sequence: bool,
     guesses: Sequence[Float[np.ndarray, "4 4"] | None] | None,
     kept: Kept,
     progress: bool,
+    options: Options,
 ) -> _Start:
     names = names_of(clouds)
-    scans, left_out = _read(clouds, names, options["seed"], progress)
+    scans, left_out = _read(clouds, names, options.get("seed", 0), progress)
     copies = twins(scans)
     foreign = of_other_sizes(scans)
     left_out += foreign
@@ -227,74 +208,3 @@ def _read(
         else:
             left_out.append(each)
     return scans, left_out
-
-
-def _search(
-    scans: Sequence[Scan],
-    registrar: Registrar,
-    tries: list[Try],
-    records: list[Record],
-    alone: bool,
-) -> tuple[list[Try], list[Record], Build]:
-    """Tries the scans outside the largest component from all rotations, one after the other.
-
-    A search takes several times as long as a plain registration, so it ends for each scan as soon
-    as the scan has found its place.
-    """
-    built = build(scans, tries, records, alone=alone)
-    for row in np.flatnonzero(built.placement.component > 0).tolist():
-        if built.placement.component[row] == 0:
-            continue
-        others = np.flatnonzero(built.placement.component != built.placement.component[row])
-        sure = 0
-        for other in others.tolist():
-            [pair] = choosing.all_pairs([scans[row], scans[other]])
-            tries, records = [*tries, pair], [*records, *registrar.records([pair], ANYWHERE)]
-            sure += (records[-1]["confidence"] or 0.0) >= SURE
-            if sure >= _ENOUGH:
-                break
-        built = build(scans, tries, records, alone=alone)
-    return tries, records, built
-
-
-def _closures(scans: Sequence[Scan], tries: Sequence[Try], built: Build) -> list[Try]:
-    known = {frozenset((pair.source, pair.target)) for pair in tries}
-    made = []
-    placement = built.placement
-    for label in np.unique(placement.component):
-        rows = np.flatnonzero(placement.component == label)
-        members = [scans[row] for row in rows.tolist()]
-        made += choosing.brought_together(members, placement.poses[rows], known, _CLOSING)
-    return made
-
-
-def _fused(
-    clouds: Sequence[Any],
-    scans: Sequence[Scan],
-    found: Merged,
-    copies: Mapping[int, int],
-    voxel: float | None,
-    progress: bool,
-) -> tuple[Fused, ...]:
-    size = voxel or float(np.median([_full_spacing(scan) for scan in scans]))
-    models = []
-    with Progress(
-        total=len(found.placed), desc="fusing", unit=" scans", disable=not progress
-    ) as bar:
-
-        def members(rows: np.ndarray) -> Iterator[tuple[int, PointCloud, np.ndarray]]:
-            for row in rows:
-                index = int(found.placed[row])
-                if index not in copies:  # otherwise the same points would count twice
-                    cloud = as_point_cloud(clouds[index], name=found.names[index])
-                    yield index, cloud, found.poses[row]
-                bar.update()
-
-        for _, rows in found.by_component():
-            models.append(fuse(members(rows), size))
-    return tuple(models)
-
-
-def _full_spacing(scan: Scan) -> float:
-    """An estimate of the spacing of all points of a scan, before thinning, for a surface."""
-    return scan.spacing * float(np.sqrt(len(scan.cloud) / scan.total))

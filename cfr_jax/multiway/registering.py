@@ -6,7 +6,7 @@ A target that many scans share is encoded once, because `choosing` orders the pa
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypedDict, runtime_checkable
 
 from cfr_jax.alignment.align import align
 from cfr_jax.batch.jobs import Job
@@ -14,12 +14,23 @@ from cfr_jax.batch.records import as_record
 from cfr_jax.batch.stream import Outcome, align_many
 from cfr_jax.multiway.choosing import Try
 from cfr_jax.multiway.scans import Scan
+from cfr_jax.networks.record import Params
 from cfr_jax.runtime.progress import Progress
 
 Record = dict[str, Any]
 NEAR, CLOSURE, ANYWHERE = range(3)
 """The kind of start: where the scans lie, where the poses put them, or all rotations. Two scans may
 have one record of each kind."""
+
+
+class Options(TypedDict, total=False):
+    """Options of the registration: arguments of `align_many`, with its defaults."""
+
+    params: Params | None
+    max_points: int | None
+    seed: int
+    batch: int | None
+    workers: int | None
 
 
 @runtime_checkable
@@ -45,9 +56,7 @@ class Memory(dict[tuple[str, str, int], Record]):
 class Registrar:
     """Registers pairs of scans, and skips those that are already done."""
 
-    def __init__(
-        self, scans: Mapping[int, Scan], kept: Kept, options: dict[str, Any], *, progress: bool
-    ):
+    def __init__(self, scans: Mapping[int, Scan], kept: Kept, options: Options, *, progress: bool):
         self._scans, self._kept = scans, kept
         self._options, self._progress = options, progress
 
@@ -77,7 +86,9 @@ class Registrar:
 
     def _searched(self, row: int, pair: Try) -> Outcome:
         """The answer of a search over all rotations, which works on one pair at a time."""
-        options = {name: value for name, value in self._options.items() if name not in _OF_BATCHES}
+        options: dict[str, Any] = {
+            name: value for name, value in self._options.items() if name not in _OF_BATCHES
+        }
         try:
             found = align(*self._pair(pair)[:2], initial="global", **options)
         except ValueError as error:

@@ -69,6 +69,11 @@ class Scan:
         return float(np.median(self.tree.query(self.points[:1000], k=2)[0][:, 1]))
 
     @property
+    def full_spacing(self) -> float:
+        """An estimate of the spacing of all its points, before thinning, for a surface."""
+        return self.spacing * float(np.sqrt(len(self.cloud) / self.total))
+
+    @property
     def _order(self) -> np.ndarray:
         return np.random.default_rng(0).permutation(len(self.cloud))
 

@@ -10,7 +10,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.runtime.fields import check_types
 from cfr_jax.training.step import PRECISIONS
 
@@ -43,8 +43,8 @@ class DataSection:
 class SamplingSection:
     """How training pairs are drawn.
 
-    These are fields of `data.augment.Sampling`, which explains and checks them. A "share of pairs"
-    says how often something happens to a pair.
+    These are fields of `data.augmentation.sampling.Sampling`, which explains and checks them. A
+    "share of pairs" says how often something happens to a pair.
     """
 
     keep: Range = (0.55, 0.85)  # share of points that each crop keeps; the test protocol has 0.7

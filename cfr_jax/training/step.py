@@ -14,8 +14,8 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Int, Int32, PyTree, UInt32
 
-from cfr_jax.data.augment import Sampling
-from cfr_jax.data.device_pairs import Shapes, draw_pairs
+from cfr_jax.data.augmentation.pairs_on_device import Shapes, draw_pairs
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks.inputs import Cloud
 from cfr_jax.networks.peers.batch_norm import PAIRS
@@ -103,7 +103,7 @@ def train_on_drawn(
     recipe: Recipe,
     sampling: Sampling,
 ) -> tuple[TrainState, PairLoss]:
-    """`k` steps at once, each on pairs that the devices draw (`data.device_pairs`).
+    """`k` steps at once, each on pairs that the devices draw (`data.augmentation.pairs_on_device`).
 
     Step i draws pairs of the shapes `items[i]` at the positions `positions[i]` of the stream. Also
     returns the losses of all k b pairs.

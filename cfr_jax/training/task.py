@@ -11,7 +11,7 @@ import numpy as np
 import optax
 from jax.sharding import Mesh
 
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.making.build import ENOUGH
 from cfr_jax.data.mixture import (
     Mixture,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cfr_jax import io
-from cfr_jax.batch.journal import line_of
+from cfr_jax.batch.checked_lines import line_of
 from cfr_jax.cli import main
 from cfr_jax.cli.shared import outputs
 

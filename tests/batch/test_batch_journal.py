@@ -14,7 +14,8 @@ import sys
 import jax
 import pytest
 
-from cfr_jax.batch.journal import Journal, line_of
+from cfr_jax.batch.checked_lines import line_of
+from cfr_jax.batch.journal import Journal
 from cfr_jax.batch.sharding import Shard, other_shards, parse_shard, process_shard
 
 MADE_WITH = {"weights": "a" * 64, "seed": 0}

@@ -13,6 +13,7 @@ import pytest
 from cfr_jax import io
 from cfr_jax.cli import main
 from cfr_jax.cli.shared import report
+from cfr_jax.weights import files
 from cfr_jax.weights.files import Weights
 
 POINTS = cli_samples.points(300, 0)
@@ -31,7 +32,7 @@ def given(tmp_path, monkeypatch):
         return cli_samples.alignment(source, target)
 
     monkeypatch.setattr(report, "align", align)
-    monkeypatch.setattr(report, "read_weights", lambda *_: Weights({}, "w", "cfr", "0" * 64, {}))
+    monkeypatch.setattr(files, "read_weights", lambda *_: Weights({}, "w", "cfr", "0" * 64, {}))
     monkeypatch.chdir(tmp_path)
     np.savetxt("timed.txt", np.c_[TIMES, POINTS])
     np.savetxt("bright.txt", np.c_[POINTS + 1, TIMES % 7])

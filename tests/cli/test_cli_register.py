@@ -17,6 +17,7 @@ import cfr_jax
 from cfr_jax import io
 from cfr_jax.cli import main
 from cfr_jax.cli.shared import report
+from cfr_jax.weights import files
 from cfr_jax.weights.files import Weights
 
 SCHEMA = json.loads(
@@ -41,7 +42,7 @@ def answering(monkeypatch):
 
         monkeypatch.setattr(report, "align", align)
         monkeypatch.setattr(
-            report,
+            files,
             "read_weights",
             lambda name, network: Weights({}, f"<{name}>", network, "0" * 64, {}),
         )

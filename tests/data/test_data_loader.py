@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from oracle import pieces
 
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.loader import batch_at, batches
 from cfr_jax.data.mixture import Mixture

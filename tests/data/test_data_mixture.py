@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from cfr_jax import io
 from cfr_jax.data import mixture as mixtures
 from cfr_jax.data import scenes
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.kinds import clouds, kitti, pair_file, pair_list
 from cfr_jax.data.pairs import Pair
 

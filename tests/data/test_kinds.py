@@ -17,7 +17,7 @@ from cfr_jax import io
 from cfr_jax.batch import stream
 from cfr_jax.cli import main
 from cfr_jax.data import kinds
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.kinds.kind import DataKind, Listing, settings_of
 from cfr_jax.data.layout import recognize
 from cfr_jax.data.mixture import fixed_pairs, open_mixture

@@ -159,13 +159,14 @@ class JournalFile(Door):
 
     def __init__(self, folder: Path):
         super().__init__(folder)
-        from cfr_jax.batch import journal
+        from cfr_jax.batch import checked_lines
+        from cfr_jax.batch.journal import Journal
 
-        self.module = journal
+        self.checked_lines, self.journal = checked_lines, Journal
         header = {"format": "cfr_jax/batch/2", "made_with": self.made_with}
         record = {"source": "a", "target": "b", "repeat": 0, "error": None, "transform": _MOTION}
         self.values = [header, record, record | {"source": "c"}, record | {"error": "is empty"}]
-        self.lines = [journal.line_of(value) for value in self.values]
+        self.lines = [checked_lines.line_of(value) for value in self.values]
 
     def make(self, generator: random.Random) -> tuple[Path, bool]:
         lines = list(self.lines)
@@ -175,7 +176,7 @@ class JournalFile(Door):
             return self.write("j.jsonl", damaged), self._only_whole_lines(damaged)
         changed = mutants.mutate_json(self.values[row], generator)
         if generator.random() < 0.5:  # with a checksum that fits, as somebody might write it
-            check = self.module._check(changed).encode()
+            check = self.checked_lines._check(changed).encode()
             lines[row] = changed[:-1] + b', "check": "' + check + b'"}\n'
             return self.write("j.jsonl", b"".join(lines)), True
         lines[row] = changed + b"\n"
@@ -188,7 +189,7 @@ class JournalFile(Door):
         return all(line + b"\n" in self.lines for line in whole)
 
     def read(self, path: Path) -> Any:
-        with self.module.Journal(path, self.made_with) as held:
+        with self.journal(path, self.made_with) as held:
             for key in held:
                 assert held[key]["source"] == key[0]
 

@@ -11,7 +11,7 @@ import training_samples as samples
 from oracle import clouds
 
 from cfr_jax.alignment.solving import DeviceCloud, solve_pair
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.corpus import read_corpus
 from cfr_jax.data.loader import batch_at
 from cfr_jax.data.sources import ShapeSource

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import training_samples
 
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.pairs_on_device import Shapes, draw_pairs
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.corpus import read_corpus
-from cfr_jax.data.device_pairs import Shapes, draw_pairs
 from cfr_jax.data.sources import ShapeSource
 from cfr_jax.geometry import rigid
 from cfr_jax.training import learner, loop

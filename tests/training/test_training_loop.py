@@ -11,7 +11,7 @@ import pytest
 import training_samples as samples
 from training_samples import assert_same, config
 
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.training import (
     devices,
     identity,

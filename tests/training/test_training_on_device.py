@@ -11,9 +11,9 @@ import pytest
 import training_samples as samples
 from training_samples import BATCH, NEIGHBORS, POINTS, assert_same, fresh, recipe
 
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.pairs_on_device import Shapes, draw_pairs
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.corpus import Corpus, read_corpus
-from cfr_jax.data.device_pairs import Shapes, draw_pairs
 from cfr_jax.data.loader import items_at
 from cfr_jax.data.mixture import Mixture
 from cfr_jax.data.sources import ShapeSource

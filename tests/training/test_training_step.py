@@ -10,7 +10,7 @@ import training_samples as samples
 from jax.extend.core import jaxprs_in_params
 from training_samples import BATCH, NEIGHBORS, POINTS, assert_same, fresh, recipe
 
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.corpus import read_corpus
 from cfr_jax.data.loader import batch_at
 from cfr_jax.data.sources import ShapeSource

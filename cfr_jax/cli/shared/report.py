@@ -14,10 +14,11 @@ from cfr_jax import __version__
 from cfr_jax.alignment.align import align
 from cfr_jax.alignment.answers import Alignment
 from cfr_jax.alignment.planning import Initial
+from cfr_jax.cli.shared.flags import weights_of
 from cfr_jax.geometry import motions
 from cfr_jax.io import PointCloud
 from cfr_jax.viewer import Scene
-from cfr_jax.weights.files import DEFAULT, Weights, read_weights
+from cfr_jax.weights.files import Weights
 
 FORMAT = "cfr_jax/register/1"
 
@@ -63,7 +64,7 @@ def register(
     seed: int = 0,
 ) -> Result:
     """`align` with weights by name or path; raises ValueError like `align` and `read_weights`."""
-    chosen = read_weights(DEFAULT if weights is None else weights, "cfr")
+    chosen = weights_of(weights)
     alignment = align(
         source,
         target,

@@ -28,13 +28,12 @@ from cfr_jax.data.corpus import Corpus
 from cfr_jax.data.kinds.kind import settings_of
 from cfr_jax.data.layout import recognize
 from cfr_jax.data.pairs import Pair
+from cfr_jax.data.perturbations import crop, random_motion
 from cfr_jax.data.protocol import (
-    crop,
     low_overlap,
     partial,
     partial_any_rotation,
     partial_both_ways,
-    random_motion,
     random_pair,
 )
 

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from jax.sharding import Mesh
 
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.mixture import Mixture
 from cfr_jax.training.config import Phase, TrainingConfig
 from cfr_jax.training.losses import PairLoss

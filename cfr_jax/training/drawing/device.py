@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from cfr_jax.data.augmentation.pairs_on_device import Shapes
 from cfr_jax.data.corpus import Corpus
-from cfr_jax.data.device_pairs import Shapes
 from cfr_jax.data.loader import items_at
 from cfr_jax.data.mixture import Mixture
 from cfr_jax.data.sources import ShapeSource

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import ks_2samp
 
-from cfr_jax.data.augment import Sampling
+from cfr_jax.data.augmentation.pairs_on_device import Shapes, draw_pairs
+from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.corpus import Corpus
-from cfr_jax.data.device_pairs import Shapes, draw_pairs
 from cfr_jax.data.sources import ShapeSource
 from cfr_jax.geometry.neighbors import nearest_on_host
 

@@ -5,8 +5,9 @@ import pytest
 from oracle import pieces
 from scipy.spatial.transform import Rotation
 
-from cfr_jax.data import augment
-from cfr_jax.data.augment import Sampling, View, choose_rows, finish_pair
+from cfr_jax.data.augmentation import pairs_on_host
+from cfr_jax.data.augmentation.pairs_on_host import View, choose_rows, finish_pair
+from cfr_jax.data.augmentation.sampling import Sampling
 
 STILL = {"keep": (1.0, 1.0), "noise": (0.0, 0.0), "angle": 0.0, "translation": 0.0}
 
@@ -124,12 +125,12 @@ def test_noise_has_the_strength_asked_for_on_every_axis(sphere):
 
 
 def test_sensor_noise_lies_along_the_rays_and_grows_with_distance_squared(sphere, monkeypatch):
-    monkeypatch.setattr(augment, "_direction", lambda rng: np.array([0.0, 0.0, 1.0]))
-    monkeypatch.setattr(augment, "SENSOR_AWAY", (2.0, 2.0))
+    monkeypatch.setattr(pairs_on_host, "_direction", lambda rng: np.array([0.0, 0.0, 1.0]))
+    monkeypatch.setattr(pairs_on_host, "SENSOR_AWAY", (2.0, 2.0))
     points = np.repeat(sphere.astype(np.float64), 20, axis=0)
     sampling = still(sensor_scale=(0.01, 0.01))
 
-    moved = augment.add_sensor_noise(points, sampling, np.random.default_rng(0))
+    moved = pairs_on_host.add_sensor_noise(points, sampling, np.random.default_rng(0))
 
     ray = points - (points.mean(axis=0) + [0, 0, 2])
     distance = np.linalg.norm(ray, axis=1, keepdims=True)
