@@ -19,6 +19,7 @@ from cfr_jax.data.making.build import folder_items
 from cfr_jax.io import CloudFileError, PointCloud, as_point_cloud, formats, read, write
 from cfr_jax.io.formats import Format, add_format
 from cfr_jax.io.mesh import Mesh
+from cfr_jax.weights import files
 from cfr_jax.weights.files import Weights
 
 ROOT = Path(__file__).parents[2]
@@ -83,7 +84,7 @@ def test_cfr_register_reads_and_writes_a_format_from_outside(toys, tmp_path, mon
         return cli_samples.alignment(source, target)
 
     monkeypatch.setattr(report, "align", align)
-    monkeypatch.setattr(report, "read_weights", lambda *_: Weights({}, "w", "cfr", "0" * 64, {}))
+    monkeypatch.setattr(files, "read_weights", lambda *_: Weights({}, "w", "cfr", "0" * 64, {}))
     source, target, moved = (tmp_path / f"{name}.toy" for name in ("source", "target", "moved"))
     write(source, PointCloud(POINTS))
     write(target, PointCloud(POINTS + 1))

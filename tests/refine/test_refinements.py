@@ -59,7 +59,7 @@ def table(monkeypatch):
 
 @pytest.fixture(scope="module")
 def pair():
-    return solids.two_samplings(256, TRUTH)
+    return solids.two_samplings(512, TRUTH)
 
 
 @pytest.fixture(scope="module")

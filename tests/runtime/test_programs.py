@@ -148,7 +148,8 @@ def test_all_programs_of_the_command_line_can_be_kept(folder):
     list(align_many([(source, target)]))
 
     kept = {path.name.split("-")[0] for path in folder.rglob("*.stablehlo")}
-    assert kept == {
+    # "judged" runs only if an answer comes from the start, not from the network
+    assert kept - {"judged"} == {
         "propose", "polish", "solve_pair", "refined_start", "encode_target", "solve_many"
     }  # fmt: skip
 
