@@ -19,6 +19,7 @@ from cfr_jax.data.making.build import folder_items
 from cfr_jax.io import CloudFileError, PointCloud, as_point_cloud, formats, read, write
 from cfr_jax.io.formats import Format, add_format
 from cfr_jax.io.mesh import Mesh
+from cfr_jax.io.table import table_of
 from cfr_jax.weights.files import Weights
 
 ROOT = Path(__file__).parents[2]
@@ -63,6 +64,18 @@ def test_a_format_from_outside_is_read_and_written(toys, tmp_path):
         read(tmp_path / "bad.toy")
 
 
+def test_a_parser_that_gives_something_else_is_named_with_what_it_gave(toys, tmp_path):
+    def parse_dots(data, name):
+        return table_of(["x", "y", "z"], list(POINTS.T))
+
+    add_format(Format("dots", (".dots",), "cloud", parse_dots))
+    (tmp_path / "one.dots").write_text("1 2 3")
+
+    wanted = "^parse: that of the format 'dots' returned a Table, wanted a PointCloud or a Mesh"
+    with pytest.raises(TypeError, match=wanted):
+        read(tmp_path / "one.dots")
+
+
 def test_a_surface_from_outside_is_sampled_and_knows_its_folder(toys, tmp_path):
     np.savetxt(tmp_path / "corners", [[0, 0, 1], [2, 0, 1], [0, 2, 1]])
     (tmp_path / "one.toym").write_text("corners\n")
@@ -101,7 +114,7 @@ def test_cfr_register_reads_and_writes_a_format_from_outside(toys, tmp_path, mon
     # and help and messages list it
     capsys.readouterr()
     assert main(["register", "--help"]) == 0
-    told = capsys.readouterr().out
+    told = " ".join(capsys.readouterr().out.split())  # lines break where it suits the width
     assert ".toy (a toy)" in told and re.search(r"surfaces .*\.toym", told)
     assert main(["register", str(source), str(target), "--out", "moved.abc"]) == 2
     assert ".npz .toy" in capsys.readouterr().err
@@ -131,11 +144,12 @@ def test_an_unknown_suffix_is_answered_with_all_known_ones(toys, tmp_path):
         ({"suffixes": ("new",)}, r"suffixes: got \('new',\), wanted lower case"),
         ({"suffixes": (".NEW",)}, "wanted lower case"),
         ({"suffixes": ()}, "wanted lower case"),
+        ({"holds": "clouds"}, "holds: got 'clouds', wanted one of 'cloud', 'surface', 'either'"),
         ({"holds": "either"}, "has_faces: mine holds 'either'"),
         ({"has_faces": bool}, "has_faces: mine holds 'cloud'"),
     ],
 )
-def test_a_format_that_does_not_fit_is_refused(changes, message):
+def test_a_format_that_does_not_fit_is_refused(unchecked, changes, message):
     about = {"name": "mine", "suffixes": (".new",), "holds": "cloud", "parse": parse_toy}
     before = formats.known()
     with pytest.raises(ValueError, match=message):

@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, get_args
 
 if TYPE_CHECKING:
     from cfr_jax.io.cloud import PointCloud
     from cfr_jax.io.mesh import Mesh
+
+_Holds = Literal["cloud", "surface", "either"]
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class Format:
     name: str
     suffixes: tuple[str, ...]
     """Lower case, with the dot; they tell the format, and no two formats share one."""
-    holds: Literal["cloud", "surface", "either"]
+    holds: _Holds
     parse: Callable[..., PointCloud | Mesh]
     """`parse(data, name)`: from all bytes of a file, and its name, to what it holds.
 
@@ -47,6 +49,9 @@ class Format:
     """A few words that help texts put in parentheses behind the suffixes."""
 
     def __post_init__(self) -> None:
+        if self.holds not in get_args(_Holds):
+            known = ", ".join(map(repr, get_args(_Holds)))
+            raise ValueError(f"holds: got {self.holds!r}, wanted one of {known}")
         if not self.suffixes or any(
             suffix[:1] != "." or suffix != suffix.lower() for suffix in self.suffixes
         ):
