@@ -58,7 +58,7 @@ def config(tmp_path_factory):
 
 
 def test_a_metric_from_outside_stands_in_the_table_that_evaluate_writes(table, config, tmp_path):
-    text = compare(config, tmp_path, plots=False)
+    text = compare(config, tmp_path, plots=False).table
 
     header, _, identity, truth = text.splitlines()[4:8]
     place = [cell.strip() for cell in header.split("|")].index("worst point")
