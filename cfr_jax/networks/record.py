@@ -155,6 +155,6 @@ class Network:
             inner = getattr(given, "__qualname__", "")
             if "<lambda>" in inner or "<locals>" in inner:
                 raise ValueError(
-                    f"{field.name}: network {self.name} got {inner}, wanted a function of a module, "
-                    "which other processes find by its name"
+                    f"{field.name}: network {self.name} got {inner}, wanted a function of a "
+                    "module, which other processes find by its name"
                 )
