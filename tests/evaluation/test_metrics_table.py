@@ -104,6 +104,11 @@ def test_a_name_is_given_once(table):
         metrics.add(TOY)
 
 
+def test_what_is_no_metric_is_refused(unchecked):
+    with pytest.raises(ValueError, match="^new: got <function .*, wanted a Metric"):
+        metrics.add(metrics.err_r)
+
+
 @pytest.mark.parametrize("entry", [TOY, TOY.summaries[0]], ids=lambda entry: type(entry).__name__)
 def test_who_looks_an_entry_up_cannot_change_it(entry):
     with pytest.raises(dataclasses.FrozenInstanceError):

@@ -118,7 +118,7 @@ TOY = Network(
 @pytest.fixture
 def toy(monkeypatch):
     monkeypatch.setattr(table, "_registered", {})
-    table.register_network(TOY)
+    table.add(TOY)
     return TOY
 
 
@@ -168,11 +168,16 @@ def test_an_unknown_name_and_unknown_tensors_are_told_with_what_there_is(toy):
         table.recognize({"b": 1, "a": 2})
 
 
+def test_what_is_no_record_is_refused(unchecked):
+    with pytest.raises(ValueError, match="^record: got None, wanted a Network"):
+        table.add(None)
+
+
 def test_a_name_that_is_taken_stays_what_it_was(toy):
-    table.register_network(TOY)  # the same once more is fine
+    table.add(TOY)  # the same once more is fine
     for taken in ("cfr", "toy"):
         with pytest.raises(ValueError, match=f"the name '{taken}' is taken"):
-            table.register_network(dataclasses.replace(TOY, name=taken, title="Another"))
+            table.add(dataclasses.replace(TOY, name=taken, title="Another"))
 
 
 @pytest.mark.parametrize("field", ["unroll", "fresh", "recognizes", "parts"])

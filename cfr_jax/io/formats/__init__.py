@@ -1,7 +1,7 @@
 """The table of formats: everyone who reads, writes, recognizes or lists files asks here.
 
 Each format is a record below; what parses it is in a file of its own in this folder: bytes in,
-points out. `add_format` adds one from outside. The table imports neither numpy nor any parser, so
+points out. `add` adds one from outside. The table imports neither numpy nor any parser, so
 that help texts can list it.
 """
 
@@ -149,11 +149,13 @@ def writable() -> tuple[Format, ...]:
     return tuple(form for form in _FORMATS if form.save is not None)
 
 
-def add_format(new: Format) -> None:
+def add(new: Format) -> None:
     """Adds a format to the table: `read`, `write`, every command and every folder then know it.
 
     Raises ValueError where another format has one of its suffixes.
     """
+    if not isinstance(new, Format):
+        raise ValueError(f"new: got {new!r}, wanted a Format")
     taken = by_suffix(_FORMATS)
     for suffix in new.suffixes:
         if suffix in taken:
