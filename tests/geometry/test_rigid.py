@@ -241,8 +241,8 @@ def test_moving_composing_and_inverting_agree():
     moved = rigid.apply(second, rigid.apply(first, points))
 
     np.testing.assert_allclose(rigid.apply(rigid.compose(second, first), points), moved, atol=5e-6)
-    np.testing.assert_allclose(rigid.apply(rigid.inverse(second), moved), rigid.apply(first, points),
-                               atol=5e-6)  # fmt: skip
+    back = rigid.apply(rigid.inverse(second), moved)
+    np.testing.assert_allclose(back, rigid.apply(first, points), atol=5e-6)
     homogeneous = np.concatenate([points, np.ones((7, 1))], axis=1) @ np.asarray(first).T
     np.testing.assert_allclose(rigid.apply(first, points), homogeneous[:, :3], atol=5e-6)
     np.testing.assert_allclose(
