@@ -2,7 +2,8 @@
 
 Any field of the config can be set on the command line, for example --config.data.protocol=clean;
 cfr_jax/evaluation/config.py explains all fields. To resume an interrupted run, or to add methods to
-an earlier one, run the command again.
+an earlier one, run the command again. The exit code is 1 after an error, and also if a method ran
+and answered no pair.
 """
 
 import shlex
@@ -38,10 +39,14 @@ def main(_) -> None:
     try:
         if isinstance(config, MergeConfig):
             print(compare_merges(config, Path(_OUT.value), _METHODS.value, command))
-        else:
-            print(compare(config, Path(_OUT.value), _METHODS.value, _PLOTS.value, command))
+            return
+        found = compare(config, Path(_OUT.value), _METHODS.value, _PLOTS.value, command)
     except (ValueError, ModuleNotFoundError) as error:
         sys.exit(f"evaluate.py: error: {error}")
+    print(found.table, flush=True)
+    if found.unanswered:
+        told = (f"{name} answered no pair: {why}" for name, why in found.unanswered.items())
+        sys.exit("evaluate.py: error: " + "; ".join(told))
 
 
 if __name__ == "__main__":

@@ -74,7 +74,8 @@ def align(
     answer is more likely right is kept. Weights without a calibration cannot tell which one that
     is, so they get no second look.
 
-    The same call gives the same answer, bit by bit, on the same machine.
+    Of the `Alignment` that it returns, read `transform`, `trusted` and `warnings` first. The same
+    call gives the same answer, bit by bit, on the same machine.
 
     Raises ValueError for clouds without extent or with fewer than 3 points, for wrong shapes, for
     values that are not finite, and for an `initial` that is not a rigid motion or that leaves the

@@ -147,7 +147,7 @@ def mutual_fit(
         return jnp.sum(near * jnp.maximum(cosine, 0) * valid) / jnp.maximum(jnp.sum(valid), 1)
 
     there = covered(source, target, transform)
-    return (there + covered(target, source, rigid.invert(transform))) / 2
+    return (there + covered(target, source, rigid.inverse(transform))) / 2
 
 
 def _truncated(source: Surface, target: Surface, transforms: Array, distance: float) -> Array:

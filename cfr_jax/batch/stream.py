@@ -64,9 +64,8 @@ def align_many(
     With `ordered`, outcomes come in the order of the pairs. Otherwise they come as soon as they are
     done. The answers equal those of `align` up to float32 rounding. A `second_look` and the last
     refinement, on `all_points`, run pair by pair. `refine` may name any refinement that JAX can
-    trace. If a pair cannot be read or has no
-    answer, its outcome has an `error`, and the others continue. Do not change an array before its
-    outcome has come.
+    trace. If a pair cannot be read or has no answer, its outcome has an `error`, and the others
+    continue. Do not change an array before its outcome has come.
 
     Raises ValueError for invalid options, before it reads any pair.
     """

@@ -9,7 +9,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from cfr_jax import __version__
 from cfr_jax.cli import (
@@ -53,7 +53,7 @@ Registers 3D point clouds: finds the rigid motion that lays one cloud on another
 _EPILOG = """\
 exit codes:
   0    done
-  1    a bug in the program (with a traceback: please report it)
+  1    a bug, with a traceback: in the program (please report it), or in a function of yours
   2    an input, an option or an output that cannot be used (at most three lines on stderr)
   3    registered, but not to be trusted (only with --strict)
   130  interrupted
@@ -122,6 +122,14 @@ def _drop_output() -> None:
 
 class _Parser(argparse.ArgumentParser):
     """Reports errors in a few lines: the usage of a command would bury what was wrong."""
+
+    def parse_known_args(self, *given: Any, **named: Any) -> Any:
+        """Rejects unknown options here, where the command is known: the parser of all commands
+        would name neither the command nor its help."""
+        found, unknown = super().parse_known_args(*given, **named)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found, unknown
 
     def error(self, message: str) -> NoReturn:
         self.exit(UNUSABLE, _complaint(self.prog, message, f"try {self.prog} --help") + "\n")

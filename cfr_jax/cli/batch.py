@@ -49,7 +49,7 @@ def add_parser(commands: Commands) -> None:
     """Adds `cfr batch`."""
     parser = commands.add_parser(
         "batch",
-        help="many pairs, from a list or a folder, into one table",
+        help="register many pairs, from a list or a folder, into one table",
         description=_DESCRIPTION.format(kinds=_kinds()),
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -49,7 +49,7 @@ def add_parser(commands: Commands) -> None:
     """Adds `cfr merge`."""
     parser = commands.add_parser(
         "merge",
-        help="many scans of one thing into one model, and the pose of each",
+        help="merge many scans of one thing into one model, with the pose of each",
         description=_DESCRIPTION,
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,

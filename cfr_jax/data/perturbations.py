@@ -67,7 +67,7 @@ def random_motion(
     """
     motion = np.eye(4)
     if angle is None:
-        motion[:3, :3] = motions.from_quaternion(rng.normal(size=4))
+        motion[:3, :3] = motions.from_xyzw(rng.normal(size=4))
     else:
         x, y, z = (rng.uniform() * np.pi * angle / 180.0 for _ in range(3))
         if both_ways:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -24,16 +24,24 @@ from cfr_jax.evaluation.symmetry import nearly_symmetric
 from cfr_jax.runtime.atomic import write_atomically
 
 
+class Comparison(NamedTuple):
+    """What `compare` tells, besides the files it writes."""
+
+    table: str
+    unanswered: dict[str, str]
+    """The methods that ran and answered no pair, with the reason for the first one."""
+
+
 def compare(
     config: EvaluationConfig,
     out: Path,
     names: Sequence[str] = (),
     plots: bool = True,
     command: str = "",
-) -> str:
+) -> Comparison:
     """Runs the methods called `names` (if empty, all of the config), and writes into `out`.
 
-    `results.json` holds every pair with every iteration, and `table.md` the returned text; plots
+    `results.json` holds every pair with every iteration, and `table.md` the returned table; plots
     and galleries are beside them. `parts/` keeps the answers of each method, so the same call
     resumes where it stopped, and other methods or more pairs can be added later. Raises ValueError
     for a config or data that cannot be used.
@@ -86,7 +94,10 @@ def compare(
         draw_all(out / "plots", measured, pairs, about)
         for m in tqdm(measured, "gallery", disable=None):
             draw_gallery(out / "gallery" / f"{m.name}.png", m, run[m.name], pairs)
-    return table
+    unanswered = {
+        m.name: next(iter(m.failures.values())) for m in measured if len(m.failures) == len(pairs)
+    }
+    return Comparison(table, unanswered)
 
 
 def _summaries(measured: Sequence[Measured], config: EvaluationConfig) -> dict[str, Numbers]:

@@ -13,6 +13,7 @@ import numpy as np
 from cfr_jax.data.pairs import Pair
 from cfr_jax.evaluation.baselines import NAMES, baseline
 from cfr_jax.evaluation.config import EvaluationConfig
+from cfr_jax.evaluation.options import check_baseline, check_network, check_none
 from cfr_jax.evaluation.solvers.solver import Answer, Solver, clouds_of
 from cfr_jax.evaluation.store import code_digest
 from cfr_jax.networks import table
@@ -60,8 +61,8 @@ def methods_of(config: EvaluationConfig, names: Sequence[str], seed: int) -> lis
 
     A network uses the `weights` of its entry. If the entry names none, CFR uses `config.weights`
     and RPM-Net `config.rpmnet_weights`. If weights are not found, the method is left out, unless
-    they are those of `config.weights`. Raises ValueError for unknown methods, for a network without
-    weights, and for damaged weights.
+    they are those of `config.weights`. Raises ValueError for unknown methods, for options that a
+    method does not take or lacks, for a network without weights, and for damaged weights.
     """
     known = sorted(config.methods)
     unknown = [name for name in names if name not in known]
@@ -87,16 +88,18 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
     }
     make: Callable[[], Solver]
     modules = None
+    where = f"methods.{name}.options"
     if use in table.names():
+        check_network(where, use, options)
         from cfr_jax.weights.files import NoWeights, read_weights
 
         own = entry.weights or (None if use == OWN else getattr(config, f"{use}_weights", ""))
         if own == "":
             title = table.network(use).title
             raise ValueError(f"methods.{name}.weights: got none, wanted weights of {title}")
-        source = own or config.weights
+        chosen = own or config.weights
         try:
-            weights = read_weights(source, use)
+            weights = read_weights(chosen, use)
         except NoWeights as error:
             if own is None:
                 raise
@@ -105,7 +108,7 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
         make = functools.partial(
             _make_own,
             network=table.network(use),
-            weights=source,
+            weights=chosen,
             estimated=estimated,
             batch=batch,
             seed=seed,
@@ -113,11 +116,13 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
         )
         if entry.modules:
             modules = functools.partial(
-                _make_modules, table.network(use), source, options.get("settings"), estimated
+                _make_modules, table.network(use), chosen, options.get("settings"), estimated
             )
     elif use == TRUTH:
+        check_none(where, use, options)
         make = _make_truth
     elif use in NAMES:
+        check_baseline(where, use, options)
         if use in _DRAWING:
             options["seed"] = about["seed"] = seed
         make = functools.partial(make_baseline, use, options, estimated)

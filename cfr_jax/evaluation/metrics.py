@@ -1,7 +1,6 @@
 """Metrics: how far an estimated motion is from the truth, and how to summarize such errors.
 
-All metrics are in one table, which everything that measures or shows errors looks up. A new metric
-is one entry in it.
+All metrics are in one table, which all code that measures or shows errors looks up.
 
 Everything is float64 numpy on the host, for P pairs at a time. Motions are (4, 4), rigid, and map
 source onto target. Lengths are in the unit of the clouds, angles in degrees.
@@ -107,8 +106,8 @@ def _euler_difference(estimates: Motions, truths: Motions) -> Float[np.ndarray, 
         # At gimbal lock, several choices of angles describe the same rotation; any will do.
         warnings.filterwarnings("ignore", message="Gimbal lock")
         angles = [
-            Rotation.from_matrix(motions[:, :3, :3]).as_euler("xyz", degrees=True)
-            for motions in (estimates, truths)
+            Rotation.from_matrix(given[:, :3, :3]).as_euler("xyz", degrees=True)
+            for given in (estimates, truths)
         ]
     return angles[0] - angles[1]
 
@@ -232,6 +231,8 @@ def metric(name: str) -> Metric:
 
 def add(new: Metric) -> None:
     """Adds a metric to the table. Raises ValueError if its name is taken."""
+    if not isinstance(new, Metric):
+        raise ValueError(f"new: got {new!r}, wanted a Metric")
     if new.name in _TABLE:
         raise ValueError(f"name: got {new.name!r}, wanted one that is not taken")
     _TABLE[new.name] = new

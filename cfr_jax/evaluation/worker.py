@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import time
@@ -49,6 +50,7 @@ class Worker:
         self._process: Any = None
         self._pipe: Any = None
         self._warm = False
+        self._unmade: str | None = None
         self.started: Started | None = None
 
     def __enter__(self) -> Worker:
@@ -63,6 +65,8 @@ class Worker:
         Raises `Failed` if the method fails or takes more than `timeout` seconds per pair, and
         `Missing` if it cannot run at all.
         """
+        if self._unmade is not None:
+            raise Failed(self._unmade)
         allowed = timeout * len(pairs)
         if self._process is None:
             self._start()
@@ -76,12 +80,21 @@ class Worker:
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")  # forked copies of JAX or OpenMP hang
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(
+        pipe, theirs = context.Pipe()
+        process = context.Process(
             target=_serve, args=(theirs, self._method.make, self._method.threads), daemon=True
         )
-        self._process.start()
-        theirs.close()
+        try:
+            process.start()
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            pipe.close()
+            raise ValueError(
+                f"methods.{self._method.name}: cannot be sent to its own process ({error}); wanted "
+                "functions that can be imported there by name, not lambdas or inner functions"
+            ) from error
+        finally:
+            theirs.close()
+        self._pipe, self._process = pipe, process
         try:
             self._reply(None, START_UP, f"it did not start within {START_UP:g} s")
         except (Failed, Missing):
@@ -105,6 +118,8 @@ class Worker:
         if kind == "missing":
             raise Missing(content)
         if kind == "failed":
+            if request is None:
+                self._unmade = content  # it would fail again for every pair
             raise Failed(content)
         return content
 

@@ -127,7 +127,7 @@ def _fault(transform: Float[np.ndarray, "4 4"]) -> str:
     return f"the last row is {transform[3].tolist()}"
 
 
-def from_quaternion(
+def from_xyzw(
     quaternions: Float[np.ndarray, "*batch 4"],
 ) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotations for quaternions (x, y, z, w) of any nonzero length."""
@@ -135,7 +135,7 @@ def from_quaternion(
     return _of_unit(quaternions / np.sqrt(x * x + y * y + z * z + w * w)[..., None])
 
 
-def to_quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
+def to_xyzw(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
     """Unit quaternion (x, y, z, w), w >= 0, of a rotation or of a matrix that is nearly one.
 
     It is the eigenvector for the largest eigenvalue of a symmetric matrix that is linear in the
@@ -168,7 +168,7 @@ def from_rotvec(turns: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*bat
 
 def to_rotvec(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
     """The inverse of `from_rotvec`: a rotation vector of length at most pi, in radians."""
-    *axis, w = to_quaternion(rotation)
+    *axis, w = to_xyzw(rotation)
     sine = float(np.linalg.norm(axis))
     return np.array(axis) * (2 * np.arctan2(sine, w) / sine if sine else 2.0)
 
@@ -201,4 +201,4 @@ def cover(count: int) -> Float[np.ndarray, "count 3 3"]:
     inner, outer = np.sqrt(share), np.sqrt(1 - share)
     parts = (np.sin(first), inner), (np.cos(first), inner), (np.sin(second), outer)
     quaternions = [weight * wave for wave, weight in (*parts, (np.cos(second), outer))]
-    return from_quaternion(np.stack(quaternions, axis=1))
+    return from_xyzw(np.stack(quaternions, axis=1))

@@ -43,7 +43,7 @@ def compose(second: Float[Array, "4 4"], first: Float[Array, "4 4"]) -> Float[Ar
     return jnp.matmul(second, first, precision=_HIGHEST)
 
 
-def invert(transform: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
+def inverse(transform: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
     """The inverse motion; exact for rigid motions, wrong for any other matrix."""
     back = transform[:3, :3].T
     return from_parts(back, -jnp.matmul(back, transform[:3, 3], precision=_HIGHEST))
@@ -104,7 +104,7 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
             [yx - xy, xz + zx, yz + zy, zz - xx - yy],
         ]
     )
-    return from_quaternion(leading_eigenvector(horn))
+    return from_wxyz(leading_eigenvector(horn))
 
 
 @nearest_rotation.defjvp
@@ -126,7 +126,7 @@ def _nearest_rotation_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tupl
     return rotation, jnp.matmul(rotation, skew(turn), precision=_HIGHEST)
 
 
-def from_quaternion(quaternion: Float[Array, " 4"]) -> Float[Array, "3 3"]:
+def from_wxyz(quaternion: Float[Array, " 4"]) -> Float[Array, "3 3"]:
     """Rotation for a quaternion (w, x, y, z) of any nonzero length."""
     w, x, y, z = quaternion * lax.rsqrt(jnp.sum(quaternion * quaternion))
     return jnp.array(
@@ -169,7 +169,7 @@ def exp(twist: Float[Array, " 6"]) -> Float[Array, "4 4"]:
 
 def log(transform: Float[Array, "4 4"]) -> Float[Array, " 6"]:
     """The inverse of `exp`: the twist of a motion, with a rotation vector of length at most pi."""
-    quaternion = to_quaternion(transform[:3, :3])
+    quaternion = to_wxyz(transform[:3, :3])
     w, axis = quaternion[0], quaternion[1:]
     square = jnp.sum(axis * axis)
     small = square < 1e-6
@@ -186,7 +186,7 @@ def log(transform: Float[Array, "4 4"]) -> Float[Array, " 6"]:
     return jnp.concatenate([turn, jnp.matmul(back, transform[:3, 3], precision=_HIGHEST)])
 
 
-def to_quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, " 4"]:
+def to_wxyz(rotation: Float[Array, "3 3"]) -> Float[Array, " 4"]:
     """Unit quaternion (w, x, y, z), w >= 0, of a rotation (Shepperd, 1978: largest part first)."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     # Row k is 4 q_k q, so all four rows are parallel. The longest is the best conditioned.

@@ -93,9 +93,15 @@ def read_shape(
             raise CloudFileError(f"columns: {form.name} files say themselves what they hold")
         place = (path.parent,) if form.needs_folder else ()
         options = {"columns": columns, "whole": whole} if form.has_columns else {}
-        return form.parse(contents(path), path.name, *place, **options)
+        held = form.parse(contents(path), path.name, *place, **options)
     except ValueError as error:
         raise CloudFileError(f"{shown(path)}: {error}") from None
+    if not isinstance(held, PointCloud | Mesh):  # a format from outside may give anything
+        raise TypeError(
+            f"parse: that of the format {form.name!r} returned a {type(held).__name__}, wanted a "
+            "PointCloud or a Mesh (`Table.shape` makes one)"
+        )
+    return held
 
 
 def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:

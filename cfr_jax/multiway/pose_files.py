@@ -123,7 +123,7 @@ def _pose(place: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
     turn = np.asarray(quaternion, np.float64)
     if not np.linalg.norm(turn) > 0:
         raise ValueError(f"the quaternion {list(quaternion)} has no direction")
-    return motions.motion(motions.from_quaternion(turn), place)
+    return motions.motion(motions.from_xyzw(turn), place)
 
 
 def _from_conf(number: int, cells: list[str]) -> tuple[str, np.ndarray]:
@@ -138,7 +138,7 @@ def _from_colmap(number: int, cells: list[str]) -> tuple[str, np.ndarray]:
 
 
 def _place(pose: Float[np.ndarray, "4 4"]) -> list[float]:
-    return [*pose[:3, 3].tolist(), *motions.to_quaternion(pose[:3, :3]).tolist()]
+    return [*pose[:3, 3].tolist(), *motions.to_xyzw(pose[:3, :3]).tolist()]
 
 
 def _colmap(index: int, name: str, pose: Float[np.ndarray, "4 4"]) -> tuple[str, str]:

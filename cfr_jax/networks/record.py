@@ -108,10 +108,11 @@ class Network:
     """A network, and how it is recognized, made, run, trained and timed.
 
     An evaluation runs each method in its own process, which finds these functions by name: they
-    must be functions of a module, not lambdas. A network that accepts only some sizes of clouds
-    raises ValueError from `unroll`, where sizes are known during tracing. What must run on the host
-    goes through `jax.pure_callback` there. Running means and other values that no gradient changes
-    are part of the parameters too; `unroll` stops the gradients at them.
+    must be functions of a module; a lambda or an inner function raises ValueError. A network that
+    accepts only some sizes of clouds raises ValueError from `unroll`, where sizes are known during
+    tracing. What must run on the host goes through `jax.pure_callback` there. Running means and
+    other values that no gradient changes are part of the parameters too; `unroll` stops the
+    gradients at them.
     """
 
     name: str
@@ -147,3 +148,13 @@ class Network:
     """What a training minimizes; None for the loss of CFR, `training.losses.pair_loss`."""
     checkpoint: Checkpoint | None = None
     """How `cfr convert` reads published checkpoints; None if it reads none."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            given = getattr(self, field.name)
+            inner = getattr(given, "__qualname__", "")
+            if "<lambda>" in inner or "<locals>" in inner:
+                raise ValueError(
+                    f"{field.name}: network {self.name} got {inner}, wanted a function of a "
+                    "module, which other processes find by its name"
+                )

@@ -3,9 +3,9 @@
 A new network is a file of its own and a line in `_BUILT_IN`. To add one from outside the package,
 for example in a config file, call:
 
-    from cfr_jax.networks.table import register_network
+    from cfr_jax.networks import table
 
-    register_network(my_network)   # a `record.Network`, before its name is used
+    table.add(my_network)   # a `record.Network`, before its name is used
 
 Nothing here imports JAX: the record of a network is loaded when it is first asked for.
 """
@@ -45,11 +45,15 @@ def network(name: str) -> Network:
     return importlib.import_module(_BUILT_IN[name]).NETWORK
 
 
-def register_network(record: Network) -> None:
+def add(record: Network) -> None:
     """Adds a network from outside the package, for this process.
 
     The same record may be registered again. Raises ValueError if another network has its name.
     """
+    from cfr_jax.networks.record import Network
+
+    if not isinstance(record, Network):
+        raise ValueError(f"record: got {record!r}, wanted a Network")
     if record.name in _BUILT_IN or _registered.get(record.name, record) != record:
         raise ValueError(f"network: the name {record.name!r} is taken by another network")
     _registered[record.name] = record
@@ -58,7 +62,7 @@ def register_network(record: Network) -> None:
 def have(record: Network) -> None:
     """Registers a network that came from another process, unless it is known already."""
     if record.name not in _BUILT_IN:
-        register_network(record)
+        add(record)
 
 
 def recognize(tensors: Collection[str]) -> Network:

@@ -40,9 +40,17 @@ class Refinement:
 
     def __call__(self, source: Any, target: Any, initial: Any, **options: Any) -> Fit:
         """Returns the fit found from `initial`. Raises ModuleNotFoundError if its library is
-        missing."""
+        missing, and ValueError if the function returns no `Fit`."""
+        from cfr_jax.refine.surfaces import Fit
+
         self.require()
-        return self.function()(source, target, initial, **options)
+        found = self.function()(source, target, initial, **options)
+        if not isinstance(found, Fit):  # the function may be anyone's
+            raise ValueError(
+                f"refine: {self.name} returned a {type(found).__name__}, wanted a "
+                "cfr_jax.refine.surfaces.Fit"
+            )
+        return found
 
     def function(self) -> Callable[..., Fit]:
         """The function itself, imported if necessary."""
@@ -94,6 +102,8 @@ def names() -> tuple[str, ...]:
 def add(refinement: Refinement) -> None:
     """Puts a refinement into the table. Raises ValueError if its name is taken or contains a
     colon."""
+    if not isinstance(refinement, Refinement):
+        raise ValueError(f"refinement: got {refinement!r}, wanted a Refinement")
     if refinement.name in _TABLE or ":" in refinement.name:
         raise ValueError(
             f"name: got {refinement.name!r}, wanted a name that is not taken and has no colon"

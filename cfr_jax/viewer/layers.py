@@ -64,7 +64,7 @@ def write_layers(
                 "color": color(number),
             }
         )
-    view = motions.to_quaternion(camera.rotation).tolist()
+    view = motions.to_xyzw(camera.rotation).tolist()
     page = filled("layers.html", title, "layers", {"layers": shown, "view": view})
     write_atomically(path, page.encode())
 

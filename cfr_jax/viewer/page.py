@@ -108,7 +108,7 @@ def _payload(scene: Scene, camera: Camera, max_points: int) -> dict[str, Any]:
             {
                 "label": label,
                 "matrix": transform.tolist(),
-                "rotation": motions.to_quaternion(transform[:3, :3]).tolist(),
+                "rotation": motions.to_xyzw(transform[:3, :3]).tolist(),
                 # Position of the middle of the source. It moves evenly between two stations, no
                 # matter how far the cloud is from its origin.
                 "position": (
@@ -120,7 +120,7 @@ def _payload(scene: Scene, camera: Camera, max_points: int) -> dict[str, Any]:
                 scene.labels, scene.transforms, camera.radii, strict=True
             )
         ],
-        "view": motions.to_quaternion(camera.rotation).tolist(),
+        "view": motions.to_xyzw(camera.rotation).tolist(),
         "facts": list(scene.facts.items()),
         "warnings": list(scene.warnings),
     }

@@ -167,3 +167,18 @@ def test_a_standard_output_that_takes_nothing_gives_no_traceback(stdout, monkeyp
     if stdout == "full":
         assert child.returncode == 2 and "No space left" in child.stderr
     assert "Traceback" not in child.stderr and "Exception" not in child.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "where"),
+    [
+        (["batch", "x", "--out", "y.csv", "--no-such", "own"], "cfr batch"),
+        (["data", "info", "x", "--no-such"], "cfr data info"),
+        (["--no-such", "batch", "x", "--out", "y.csv"], "cfr"),
+    ],
+)
+def test_an_unknown_option_is_told_with_its_command_and_the_help_of_it(arguments, where, capsys):
+    assert main(arguments) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"{where}: error: unrecognized arguments: --no-such")
+    assert told.endswith(f"try {where} --help\n")

@@ -85,7 +85,7 @@ def survey(monkeypatch, tmp_path):
     Without that kind, its files look like a folder of clouds.
     """
     monkeypatch.setattr(kinds, "_KINDS", list(kinds.known()))
-    kinds.add_kind(SURVEY)
+    kinds.add(SURVEY)
     folder = tmp_path / "survey"
     folder.mkdir()
     world = np.random.default_rng(0).normal(size=(200, 3)) * [5, 3, 1]
@@ -162,8 +162,15 @@ def test_an_evaluation_measures_on_a_kind_from_outside(survey, tmp_path, named):
 def test_a_name_can_be_used_only_once():
     for name in ("kitti", "auto"):
         with pytest.raises(ValueError, match=f"name: '{name}' is taken"):
-            kinds.add_kind(DataKind(name=name, words="", recognize=lambda _: None))
+            kinds.add(DataKind(name=name, words="", recognize=lambda _: None))
     assert [kind.name for kind in kinds.known()] == NAMES
+
+
+def test_what_is_no_kind_and_a_kind_that_recognizes_nothing_are_refused(unchecked):
+    with pytest.raises(ValueError, match="^new: got 1, wanted a DataKind"):
+        kinds.add(1)
+    with pytest.raises(ValueError, match="^recognize: a got None, wanted a function of a path"):
+        DataKind("a", "a thing", None)
 
 
 @pytest.mark.parametrize(

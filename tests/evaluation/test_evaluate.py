@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
+from cfr_jax.evaluation.config import EvaluationConfig, MethodEntry
 from cfr_jax.evaluation.methods import methods_of
 from cfr_jax.networks import table
 
@@ -121,23 +122,47 @@ def test_every_config_names_methods_that_exist(path):
     assert tuple(config.main_threshold) in [tuple(pair) for pair in config.thresholds]
 
 
-@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
-def test_no_config_gives_a_baseline_an_option_that_it_does_not_take(path):
-    import inspect
+@pytest.mark.parametrize(
+    ("use", "options", "told"),
+    [
+        ("cfr", {"refined": True}, "options: cfr got refined, wanted some of refine, settings, "),
+        ("cfr", {"seed": 3}, "options: cfr got seed, wanted some of refine"),
+        ("cfr", {"settings": {"k": 3}}, "options.settings: got k, wanted some of neighbors, rad"),
+        ("gicp", {"start": "centroid"}, "options: gicp got no distances, which it needs"),
+        ("fgr", {"distance": 0.1}, "options: fgr got no feature_radius, normal_radius, which"),
+        ("ransac", {"distances": 0.1}, "options: ransac got distances, wanted some of iterations"),
+        ("identity", {"start": 1}, "options: identity got start, wanted none"),
+        ("truth", {"start": 1}, "options: truth got start, wanted none"),
+    ],
+)
+def test_options_that_a_method_does_not_take_are_refused_before_anything_runs(use, options, told):
+    config = EvaluationConfig("title", {}, {"mine": MethodEntry(use, options)})
+    with pytest.raises(ValueError, match=f"^methods.mine.{told}"):
+        methods_of(config, [], seed=0)
 
-    from cfr_jax.evaluation.baselines import NAMES, baseline
-    from cfr_jax.evaluation.baselines.open3d_clouds import FeatureOptions
 
-    for name, entry in read_config(path).methods.items():
-        if entry.use not in NAMES:
-            continue
-        taken = inspect.signature(baseline(entry.use)).parameters
-        if any(p.kind is p.VAR_KEYWORD for p in taken.values()):
-            taken = {**taken, **inspect.signature(FeatureOptions).parameters}
-        options = set(entry.options)
-        assert options <= set(taken), name
-        needed = {k for k, p in taken.items() if p.default is p.empty} - {"source", "target"}
-        assert needed - {"options"} <= options, name
+def test_a_method_that_answered_nothing_is_an_error_after_all_others_have_run(tmp_path, arguments):
+    own = tmp_path / "mine.py"
+    own.write_text(
+        f"import runpy\n"
+        f"from cfr_jax.evaluation.config import MethodEntry\n"
+        f"def get_config():\n"
+        f"    config = runpy.run_path({str(CONFIGS[0].with_name('eval_open_cad.py'))!r})\n"
+        f"    config = config['get_config']()\n"
+        f"    config.methods['mine'] = MethodEntry('cfr', {{'through': 'luck'}})\n"
+        f"    return config\n"
+    )
+    given = [a for a in arguments if not a.startswith(("--config=", "--methods"))]
+
+    run = evaluate(
+        f"--config={own}", *given, "--methods=mine,truth", "--limit=2", "--noplots",
+        f"--out={tmp_path / 'out'}",
+    )  # fmt: skip
+
+    assert run.returncode == 1
+    assert "evaluate.py: error: mine answered no pair: ValueError: through is 'luck'" in run.stderr
+    assert "| truth | 0.00 |" in run.stdout
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["methods"]["mine"]
 
 
 def test_without_normals_the_methods_are_the_same_and_none_is_given_any():

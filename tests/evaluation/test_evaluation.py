@@ -82,6 +82,12 @@ def make_missing():
     raise ModuleNotFoundError("somelib is needed: pip install somelib")
 
 
+def make_failing(path):
+    with open(path, "a") as file:
+        file.write("once\n")
+    raise ValueError("no such option")
+
+
 def make_counting(path):
     def solve(pairs):
         with open(path, "a") as file:
@@ -114,6 +120,20 @@ def test_a_method_whose_library_is_missing_is_left_out_with_the_way_out(tmp_path
     held = run_method(method, [a_pair()], tmp_path / "part.json", timeout=60.0)
     assert held.missing == "somelib is needed: pip install somelib"
     assert not held.by_pair
+
+
+def test_a_method_that_cannot_be_sent_to_its_process_says_why(tmp_path):
+    method = Method("mine", functools.partial(make_counting, lambda: None), ABOUT)
+    told = r"^methods\.mine: cannot be sent to its own process \(.*lambda.*\); wanted functions"
+    with pytest.raises(ValueError, match=told):
+        run_method(method, [a_pair()], tmp_path / "part.json", timeout=60.0)
+
+
+def test_a_method_that_cannot_be_made_is_made_once(tmp_path):
+    method = Method("unmade", functools.partial(make_failing, tmp_path / "made"), ABOUT)
+    held = run_method(method, [a_pair(0), a_pair(1)], tmp_path / "part.json", timeout=60.0)
+    assert [held.by_pair[k].failure for k in (0, 1)] == ["ValueError: no such option"] * 2
+    assert (tmp_path / "made").read_text() == "once\n"
 
 
 def test_a_run_goes_on_with_the_pairs_that_have_no_answer_yet(tmp_path):

@@ -58,7 +58,7 @@ def config(tmp_path_factory):
 
 
 def test_a_metric_from_outside_stands_in_the_table_that_evaluate_writes(table, config, tmp_path):
-    text = compare(config, tmp_path, plots=False)
+    text = compare(config, tmp_path, plots=False).table
 
     header, _, identity, truth = text.splitlines()[4:8]
     place = [cell.strip() for cell in header.split("|")].index("worst point")
@@ -102,6 +102,11 @@ def test_a_metric_of_whole_shapes_is_not_measured_without_them():
 def test_a_name_is_given_once(table):
     with pytest.raises(ValueError, match="^name: got 'farthest', wanted one that is not taken"):
         metrics.add(TOY)
+
+
+def test_what_is_no_metric_is_refused(unchecked):
+    with pytest.raises(ValueError, match="^new: got <function .*, wanted a Metric"):
+        metrics.add(metrics.err_r)
 
 
 @pytest.mark.parametrize("entry", [TOY, TOY.summaries[0]], ids=lambda entry: type(entry).__name__)

@@ -127,12 +127,12 @@ def test_the_tolerance_applies_to_the_product_with_the_transpose(scale, rigid):
 def test_quaternions_match_scipy_in_both_directions():
     quaternions = np.random.default_rng(0).normal(size=(100, 4))
 
-    found = motions.from_quaternion(quaternions)
+    found = motions.from_xyzw(quaternions)
 
     np.testing.assert_allclose(found, Rotation.from_quat(quaternions).as_matrix(), atol=1e-15)
     for quaternion, rotation in zip(quaternions, found, strict=True):
         unit = quaternion / np.linalg.norm(quaternion) * np.sign(quaternion[3])
-        np.testing.assert_allclose(motions.to_quaternion(rotation), unit, atol=1e-14)
+        np.testing.assert_allclose(motions.to_xyzw(rotation), unit, atol=1e-14)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 2.0, np.pi - 1e-9, np.pi])
@@ -140,7 +140,7 @@ def test_quaternions_match_scipy_in_both_directions():
 def test_quaternions_are_accurate_up_to_half_a_turn(axis, angle):
     rotation = Rotation.from_rotvec(np.array(axis) / np.linalg.norm(axis) * angle)
 
-    found = Rotation.from_quat(motions.to_quaternion(rotation.as_matrix()))
+    found = Rotation.from_quat(motions.to_xyzw(rotation.as_matrix()))
 
     assert (found * rotation.inv()).magnitude() < 1e-7
 

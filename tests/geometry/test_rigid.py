@@ -241,8 +241,8 @@ def test_moving_composing_and_inverting_agree():
     moved = rigid.apply(second, rigid.apply(first, points))
 
     np.testing.assert_allclose(rigid.apply(rigid.compose(second, first), points), moved, atol=5e-6)
-    np.testing.assert_allclose(rigid.apply(rigid.invert(second), moved), rigid.apply(first, points),
-                               atol=5e-6)  # fmt: skip
+    back = rigid.apply(rigid.inverse(second), moved)
+    np.testing.assert_allclose(back, rigid.apply(first, points), atol=5e-6)
     homogeneous = np.concatenate([points, np.ones((7, 1))], axis=1) @ np.asarray(first).T
     np.testing.assert_allclose(rigid.apply(first, points), homogeneous[:, :3], atol=5e-6)
     np.testing.assert_allclose(
@@ -256,11 +256,11 @@ def test_quaternions_convert_in_both_directions():
     for given in (rotations, half_turns):
         matrices = jnp.asarray(given.as_matrix(), jnp.float32)
 
-        quaternions = jax.jit(jax.vmap(rigid.to_quaternion))(matrices)
+        quaternions = jax.jit(jax.vmap(rigid.to_wxyz))(matrices)
 
         assert (quaternions[:, 0] >= 0).all()
         np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1, atol=1e-6)
-        back = jax.jit(jax.vmap(rigid.from_quaternion))(quaternions)
+        back = jax.jit(jax.vmap(rigid.from_wxyz))(quaternions)
         np.testing.assert_allclose(back, matrices, atol=2e-6)
 
 

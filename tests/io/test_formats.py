@@ -17,9 +17,9 @@ from cfr_jax.cli.shared import report
 from cfr_jax.data.layout import recognize
 from cfr_jax.data.making.build import folder_items
 from cfr_jax.io import CloudFileError, PointCloud, as_point_cloud, formats, read, write
-from cfr_jax.io.formats import Format, add_format
+from cfr_jax.io.formats import Format
 from cfr_jax.io.mesh import Mesh
-from cfr_jax.weights import files
+from cfr_jax.io.table import table_of
 from cfr_jax.weights.files import Weights
 
 ROOT = Path(__file__).parents[2]
@@ -47,8 +47,8 @@ def parse_toy_mesh(data: bytes, name: str, folder: Path) -> Mesh:
 def toys(monkeypatch):
     """The table with a format of clouds and one of surfaces more, for one test."""
     monkeypatch.setattr(formats, "_FORMATS", list(formats.known()))
-    add_format(Format("toy", (".toy",), "cloud", parse_toy, save_toy, note="a toy"))
-    add_format(Format("toy mesh", (".toym",), "surface", parse_toy_mesh, needs_folder=True))
+    formats.add(Format("toy", (".toy",), "cloud", parse_toy, save_toy, note="a toy"))
+    formats.add(Format("toy mesh", (".toym",), "surface", parse_toy_mesh, needs_folder=True))
 
 
 def test_a_format_from_outside_is_read_and_written(toys, tmp_path):
@@ -62,6 +62,18 @@ def test_a_format_from_outside_is_read_and_written(toys, tmp_path):
     (tmp_path / "bad.toy").write_text("points")
     with pytest.raises(CloudFileError, match=r"bad\.toy: byte 0: is b'p', wanted"):
         read(tmp_path / "bad.toy")
+
+
+def test_a_parser_that_gives_something_else_is_named_with_what_it_gave(toys, tmp_path):
+    def parse_dots(data, name):
+        return table_of(["x", "y", "z"], list(POINTS.T))
+
+    formats.add(Format("dots", (".dots",), "cloud", parse_dots))
+    (tmp_path / "one.dots").write_text("1 2 3")
+
+    wanted = "^parse: that of the format 'dots' returned a Table, wanted a PointCloud or a Mesh"
+    with pytest.raises(TypeError, match=wanted):
+        read(tmp_path / "one.dots")
 
 
 def test_a_surface_from_outside_is_sampled_and_knows_its_folder(toys, tmp_path):
@@ -84,7 +96,7 @@ def test_cfr_register_reads_and_writes_a_format_from_outside(toys, tmp_path, mon
         return cli_samples.alignment(source, target)
 
     monkeypatch.setattr(report, "align", align)
-    monkeypatch.setattr(files, "read_weights", lambda *_: Weights({}, "w", "cfr", "0" * 64, {}))
+    monkeypatch.setattr(report, "weights_of", lambda *_: Weights({}, "w", "cfr", "0" * 64, {}))
     source, target, moved = (tmp_path / f"{name}.toy" for name in ("source", "target", "moved"))
     write(source, PointCloud(POINTS))
     write(target, PointCloud(POINTS + 1))
@@ -102,7 +114,7 @@ def test_cfr_register_reads_and_writes_a_format_from_outside(toys, tmp_path, mon
     # and help and messages list it
     capsys.readouterr()
     assert main(["register", "--help"]) == 0
-    told = capsys.readouterr().out
+    told = " ".join(capsys.readouterr().out.split())  # lines break where it suits the width
     assert ".toy (a toy)" in told and re.search(r"surfaces .*\.toym", told)
     assert main(["register", str(source), str(target), "--out", "moved.abc"]) == 2
     assert ".npz .toy" in capsys.readouterr().err
@@ -132,16 +144,22 @@ def test_an_unknown_suffix_is_answered_with_all_known_ones(toys, tmp_path):
         ({"suffixes": ("new",)}, r"suffixes: got \('new',\), wanted lower case"),
         ({"suffixes": (".NEW",)}, "wanted lower case"),
         ({"suffixes": ()}, "wanted lower case"),
+        ({"holds": "clouds"}, "holds: got 'clouds', wanted one of 'cloud', 'surface', 'either'"),
         ({"holds": "either"}, "has_faces: mine holds 'either'"),
         ({"has_faces": bool}, "has_faces: mine holds 'cloud'"),
     ],
 )
-def test_a_format_that_does_not_fit_is_refused(changes, message):
+def test_a_format_that_does_not_fit_is_refused(unchecked, changes, message):
     about = {"name": "mine", "suffixes": (".new",), "holds": "cloud", "parse": parse_toy}
     before = formats.known()
     with pytest.raises(ValueError, match=message):
-        add_format(Format(**(about | changes)))
+        formats.add(Format(**(about | changes)))
     assert formats.known() == before
+
+
+def test_what_is_no_format_is_refused(unchecked):
+    with pytest.raises(ValueError, match=r"^new: got '\.toy', wanted a Format"):
+        formats.add(".toy")
 
 
 @pytest.mark.parametrize("form", formats.known(), ids=lambda form: form.name)

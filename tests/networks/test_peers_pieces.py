@@ -116,7 +116,7 @@ def test_steps_go_back_what_the_cloud_was_moved(encoder):
 
     def solve(points):
         wanted, slope = jacobian(encode, points, jnp.full(6, 1e-3))
-        return steps_of(encode, rigid.apply(rigid.invert(motion), points), wanted, slope, 10)
+        return steps_of(encode, rigid.apply(rigid.inverse(motion), points), wanted, slope, 10)
 
     found = jax.jit(solve)(points)
 

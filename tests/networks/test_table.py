@@ -118,7 +118,7 @@ TOY = Network(
 @pytest.fixture
 def toy(monkeypatch):
     monkeypatch.setattr(table, "_registered", {})
-    table.register_network(TOY)
+    table.add(TOY)
     return TOY
 
 
@@ -162,17 +162,28 @@ def test_what_a_network_makes_it_recognizes_and_describes(name):
 def test_an_unknown_name_and_unknown_tensors_are_told_with_what_there_is(toy):
     with pytest.raises(ValueError, match="got 'prnet', wanted one of 'cfr', 'rpmnet', .*'toy'"):
         table.network("prnet")
-    with pytest.raises(
-        ValueError, match=r"no known network \(CFR, RPM-Net, DCP, FMR, RGM, Toy\) has .*: a, b"
-    ):
+    titles = ", ".join(table.network(name).title for name in table.names())
+    assert titles.startswith("CFR, ") and titles.endswith(", Toy")
+    with pytest.raises(ValueError, match=rf"no known network \({titles}\) has .*: a, b"):
         table.recognize({"b": 1, "a": 2})
 
 
+def test_what_is_no_record_is_refused(unchecked):
+    with pytest.raises(ValueError, match="^record: got None, wanted a Network"):
+        table.add(None)
+
+
 def test_a_name_that_is_taken_stays_what_it_was(toy):
-    table.register_network(TOY)  # the same once more is fine
+    table.add(TOY)  # the same once more is fine
     for taken in ("cfr", "toy"):
         with pytest.raises(ValueError, match=f"the name '{taken}' is taken"):
-            table.register_network(dataclasses.replace(TOY, name=taken, title="Another"))
+            table.add(dataclasses.replace(TOY, name=taken, title="Another"))
+
+
+@pytest.mark.parametrize("field", ["unroll", "fresh", "recognizes", "parts"])
+def test_a_record_refuses_functions_that_no_other_process_finds(field):
+    with pytest.raises(ValueError, match=f"^{field}: network toy got .*<lambda>, wanted a func"):
+        dataclasses.replace(TOY, **{field: lambda *_: []})
 
 
 # --- a network from outside, wherever networks are used ---

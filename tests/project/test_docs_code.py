@@ -144,6 +144,49 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(name, samples):
     assert child.returncode == 0, child.stderr[-3000:]
 
 
+def python_of_all_pages(folder: Path) -> list[str]:
+    """Writes the Python blocks of every page as one program; returns the names of the files."""
+    made = []
+    for name in with_blocks(lambda path: blocks_of(path, "python")):
+        blocks = [b.text for b in blocks_of(PAGES[name], "python") if not b.left_out]
+        made.append(name.replace(".md", ".py").replace("-", "_"))
+        (folder / made[-1]).write_text("\n\n".join(blocks))
+    assert {"README.py", "quickstart.py"} <= set(made)
+    return made
+
+
+def checked_types(checker: list[str], folder: Path) -> subprocess.CompletedProcess:
+    pytest.importorskip(checker[0])
+    found = Path(sys.executable).parent  # pyright asks the first python there for the libraries
+    env = os.environ | {"PATH": f"{found}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    env |= {"MYPYPATH": str(ROOT)}
+    return subprocess.run(
+        [sys.executable, "-m", *checker], cwd=folder, env=env, capture_output=True, text=True,
+        timeout=600,
+    )  # fmt: skip
+
+
+CHECKERS = {
+    "pyright": ["pyright"],
+    "mypy": ["mypy", "--config-file=", "--follow-imports=silent", "--ignore-missing-imports",
+             "--scripts-are-modules"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("checker", CHECKERS)
+def test_the_python_of_the_pages_has_the_types_that_the_package_says(checker, tmp_path):
+    made = python_of_all_pages(tmp_path)
+    child = checked_types([*CHECKERS[checker], *made], tmp_path)
+    assert child.returncode == 0, child.stdout + child.stderr
+
+
+@pytest.mark.parametrize("checker", CHECKERS)
+def test_the_checker_of_the_pages_sees_a_wrong_type(checker, tmp_path):
+    (tmp_path / "wrong.py").write_text("import cfr_jax as cfr\ncfr.register({}, 'a', 'b')\n")
+    child = checked_types([*CHECKERS[checker], "wrong.py"], tmp_path)
+    assert child.returncode == 1 and "wrong.py" in child.stdout
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", with_blocks(shell_blocks))
 def test_the_cfr_commands_of_a_page_run(name, samples, monkeypatch):

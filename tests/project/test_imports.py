@@ -28,6 +28,7 @@ ROOMS = (
     "cli",  # one file per command
 )
 MOST_FILES = 15  # of a folder
+MOST_LINES = 250  # of a file
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 
@@ -62,6 +63,11 @@ def test_the_top_level_holds_rooms_and_no_folder_is_crowded():
     for folder in {path.parent for path in FILES}:
         files = [path for path in folder.iterdir() if path.is_file()]
         assert len(files) <= MOST_FILES, f"{folder.name} has {len(files)} files"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_no_file_is_too_long_to_read_at_once(path):
+    assert len(path.read_text("utf-8").splitlines()) <= MOST_LINES
 
 
 def test_contributing_shows_this_map():

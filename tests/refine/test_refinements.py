@@ -153,6 +153,26 @@ def test_a_name_is_given_once(table):
         refine.add(refine.Refinement("toy", "again", toy))
 
 
+def matrix_only(source, target, initial):
+    return initial
+
+
+def test_one_that_returns_no_fit_is_named_with_what_it_returned(unchecked, pair, tmp_path, capsys):
+    files = [str(tmp_path / f"{side}.ply") for side in ("source", "target")]
+    for path, points in zip(files, pair, strict=True):
+        io.write(path, io.PointCloud(points))
+
+    code = cli.main(["register", *files, "--refine", f"{__name__}:matrix_only"])
+
+    wanted = f"refine: {__name__}:matrix_only returned a ndarray, wanted a cfr_jax.refine.surfaces"
+    assert code == 2 and wanted in capsys.readouterr().err
+
+
+def test_what_is_no_refinement_is_refused(unchecked):
+    with pytest.raises(ValueError, match="^refinement: got <function .*, wanted a Refinement"):
+        refine.add(matrix_only)
+
+
 @pytest.mark.parametrize("wrong", ["icp", "no_such_module:refine", f"{__name__}:no_such", "a:"])
 def test_what_is_not_there_is_refused_with_what_there_is(unchecked, wrong):
     with pytest.raises(ValueError, match=f"^refine: got '{wrong}'.*(small_gicp|imported)"):

@@ -47,7 +47,7 @@ def test_the_page_holds_every_layer_where_it_is(layers, tmp_path):
     seen = np.concatenate(places)
     scale = np.linalg.norm(points[0] - points[-1]) / np.linalg.norm(seen[0] - seen[-1])
     np.testing.assert_allclose(points, seen * scale + (points[0] - seen[0] * scale), atol=2e-3)
-    assert motions.from_quaternion(np.array(shown["view"])).shape == (3, 3)
+    assert motions.from_xyzw(np.array(shown["view"])).shape == (3, 3)
 
 
 def test_large_layers_are_thinned_alike(layers, tmp_path):

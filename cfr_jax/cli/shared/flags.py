@@ -35,8 +35,7 @@ _FLAGS: dict[str, dict[str, Any]] = {
     "--max-points": {
         "metavar": "N",
         "type": numbers.positive,
-        "help": "most points of each cloud that the network sees; more are slower (default: "
-        "chosen)",
+        "help": "most points of each cloud that the network sees; more are slower (default: 1024)",
     },
     "--thinned": {
         "action": "store_true",

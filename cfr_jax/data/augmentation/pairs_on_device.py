@@ -99,7 +99,7 @@ def draw_pair(
     placed = jnp.stack([drawn.motion, jnp.eye(4)])
     x, n, middle = jax.vmap(cloud)(random.split(of_sides, 2), placed)
     found = jax.vmap(lambda x: neighbors.nearest(x, sampling.neighbors, radius=sampling.radius))(x)
-    back = rigid.invert(drawn.motion)
+    back = rigid.inverse(drawn.motion)
     shift = rigid.rotate(back, middle[:1])[0] + back[:3, 3] - middle[1]
     pair = {
         "transform": rigid.from_parts(back[:3, :3], shift),
@@ -117,7 +117,7 @@ def _decide(key: Key[Array, ""], sampling: Sampling) -> Shared:
     turned, uneven, centered, sensor, estimate = random.uniform(of_flags, (5,)) < limits
     turn = jnp.eye(3)
     if sampling.any_orientation:
-        turn = jnp.where(turned, rigid.from_quaternion(random.normal(of_turn, (4,))), turn)
+        turn = jnp.where(turned, rigid.from_wxyz(random.normal(of_turn, (4,))), turn)
     return Shared(
         turn=turn,
         motion=_motion(of_motion, sampling),

@@ -1,6 +1,6 @@
 """The table of kinds of data, with one file per kind. All code that opens data looks here.
 
-`add_kind` adds a kind from outside. Neither the table nor its files import readers before data is
+`add` adds a kind from outside. Neither the table nor its files import readers before data is
 read, so that help texts can show the table quickly.
 """
 
@@ -34,12 +34,14 @@ def known() -> tuple[DataKind, ...]:
     return tuple(_KINDS)
 
 
-def add_kind(new: DataKind) -> None:
+def add(new: DataKind) -> None:
     """Adds a kind of data to the table for `cfr batch`, `train.py` and `evaluate.py`.
 
     Recognition tries it before all others, because a folder with a new layout may look like a
     folder of clouds. Raises ValueError if the name is taken.
     """
+    if not isinstance(new, DataKind):
+        raise ValueError(f"new: got {new!r}, wanted a DataKind")
     if new.name == "auto" or any(new.name == kind.name for kind in _KINDS):
         raise ValueError(f"name: {new.name!r} is taken, wanted another")
     _KINDS.insert(0, new)

@@ -63,6 +63,12 @@ class DataKind:
     read_shapes: Callable[[Path], Corpus] | None = None
     """For `cfr data info`: the shapes."""
 
+    def __post_init__(self) -> None:
+        if not callable(self.recognize):
+            raise ValueError(
+                f"recognize: {self.name} got {self.recognize!r}, wanted a function of a path"
+            )
+
 
 def settings_of(opener: Callable[..., Any]) -> tuple[set[str], set[str]]:
     """The settings that `train` or `evaluate` requires, and all that it accepts.

@@ -45,7 +45,7 @@ def make_network(
     *,
     network: Network,
     weights: str,
-    refine: bool | str,
+    refine: bool | str = False,
     settings: dict[str, Any] | None = None,
     through: Literal["register", "align", "preparation"] = "register",
     estimated: bool = False,

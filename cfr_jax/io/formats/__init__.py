@@ -1,7 +1,7 @@
 """The table of formats: everyone who reads, writes, recognizes or lists files asks here.
 
 Each format is a record below; what parses it is in a file of its own in this folder: bytes in,
-points out. `add_format` adds one from outside. The table imports neither numpy nor any parser, so
+points out. `add` adds one from outside. The table imports neither numpy nor any parser, so
 that help texts can list it.
 """
 
@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, get_args
 
 if TYPE_CHECKING:
     from cfr_jax.io.cloud import PointCloud
     from cfr_jax.io.mesh import Mesh
+
+_Holds = Literal["cloud", "surface", "either"]
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class Format:
     name: str
     suffixes: tuple[str, ...]
     """Lower case, with the dot; they tell the format, and no two formats share one."""
-    holds: Literal["cloud", "surface", "either"]
+    holds: _Holds
     parse: Callable[..., PointCloud | Mesh]
     """`parse(data, name)`: from all bytes of a file, and its name, to what it holds.
 
@@ -47,6 +49,9 @@ class Format:
     """A few words that help texts put in parentheses behind the suffixes."""
 
     def __post_init__(self) -> None:
+        if self.holds not in get_args(_Holds):
+            known = ", ".join(map(repr, get_args(_Holds)))
+            raise ValueError(f"holds: got {self.holds!r}, wanted one of {known}")
         if not self.suffixes or any(
             suffix[:1] != "." or suffix != suffix.lower() for suffix in self.suffixes
         ):
@@ -144,11 +149,13 @@ def writable() -> tuple[Format, ...]:
     return tuple(form for form in _FORMATS if form.save is not None)
 
 
-def add_format(new: Format) -> None:
+def add(new: Format) -> None:
     """Adds a format to the table: `read`, `write`, every command and every folder then know it.
 
     Raises ValueError where another format has one of its suffixes.
     """
+    if not isinstance(new, Format):
+        raise ValueError(f"new: got {new!r}, wanted a Format")
     taken = by_suffix(_FORMATS)
     for suffix in new.suffixes:
         if suffix in taken:

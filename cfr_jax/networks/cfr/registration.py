@@ -12,6 +12,7 @@ from numbers import Integral
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import lax
 from jaxtyping import Array, Float
@@ -62,7 +63,10 @@ class Registration:
 
 
 def encode(
-    params: Params, target: Float[Array, "m c"] | Cloud, *, settings: Settings = Settings()
+    params: Params,
+    target: Float[Array | np.ndarray, "m c"] | Cloud,
+    *,
+    settings: Settings = Settings(),
 ) -> Encoded:
     """The features of a target in every iteration, to reuse it with many sources.
 
@@ -84,8 +88,8 @@ def _encode(params: Params, target: Array | Cloud, *, settings: Settings) -> Enc
 
 def register(
     params: Params,
-    source: Float[Array, "n c"] | Cloud,
-    target: Float[Array, "m c"] | Cloud | Encoded,
+    source: Float[Array | np.ndarray, "n c"] | Cloud,
+    target: Float[Array | np.ndarray, "m c"] | Cloud | Encoded,
     *,
     iterations: int | None = None,
     cascades: int = 1,
@@ -93,9 +97,9 @@ def register(
 ) -> Registration:
     """Registers `source` onto `target`: `transform @ [x; 1]` lies on the target.
 
-    Clouds are raw arrays, (n, 3) or (n, 6) with normals, or the results of `prepare`, which takes
-    masks and your own neighbors. The target may also be the result of `encode`. Iteration i runs i
-    Sinkhorn passes.
+    Clouds are arrays of JAX or numpy, (n, 3) or (n, 6) with normals, or the results of `prepare`,
+    which takes masks and your own neighbors. The target may also be the result of `encode`.
+    Iteration i runs i Sinkhorn passes.
 
     `iterations` may be any number from 1. Beyond the L iterations of the parameters, the last layer
     is repeated on the features it was trained to receive, with its own annealing and L passes: the

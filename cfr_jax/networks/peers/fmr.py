@@ -124,7 +124,7 @@ def unroll(params: Params, source: Cloud, target: Cloud, settings: FMRSettings) 
         lambda points: encode(points, source.mask), q, vector, slope, settings.iterations
     )
     for motion in found:
-        yield Motion(rigid.compose(rigid.invert(to_target), rigid.compose(motion, to_source)))
+        yield Motion(rigid.compose(rigid.inverse(to_target), rigid.compose(motion, to_source)))
 
 
 def objective(
@@ -142,7 +142,7 @@ def objective(
     transforms = jnp.stack([each.transform for each in unroll(params, source, target, settings)])
     if not settings.supervised:
         return Goal(total, lax.stop_gradient(transforms))
-    left = rigid.compose(transforms[-1], rigid.invert(truth)) - jnp.eye(4, dtype=truth.dtype)
+    left = rigid.compose(transforms[-1], rigid.inverse(truth)) - jnp.eye(4, dtype=truth.dtype)
     return Goal(total + jnp.sum(left * left), transforms)
 
 

@@ -42,6 +42,7 @@ class Header:
 
 
 def parse_header(data: bytes) -> Header:
+    """The header at the start of a file; raises CloudFileError with the line that is wrong."""
     entries: dict[str, list[str]] = {}
     offset = lines = 0
     while "DATA" not in entries:

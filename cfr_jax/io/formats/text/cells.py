@@ -45,6 +45,7 @@ def delimiter_of(line: str, separator: str | None) -> tuple[str | None, bool, bo
 
 
 def split(line: str, delimiter: str | None) -> list[str]:
+    """The cells of a line without blanks around them; None: blanks separate them."""
     if delimiter is None:
         if '"' not in line:
             return line.split()
