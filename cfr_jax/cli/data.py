@@ -25,13 +25,15 @@ Builds the corpora that networks are trained and tested on, and shows what a cor
 
 _BUILD = """\
 Turns a folder of meshes into a corpus: 2048 points per shape, drawn by area, with the normals of
-their faces, in the unit sphere. The first folder below FOLDER is the category. Flat shapes, shapes
-with fewer than 20 faces (a box has 12: --least-faces), and duplicates are left out; left_out.txt,
-beside the corpus, names them. Meshes are files that end in
+their faces, in the unit sphere. The first folder below FOLDER is the category. Damaged files, flat
+shapes, shapes with fewer than 20 faces (a box has 12: --least-faces), and duplicates are left out;
+left_out.txt, beside the corpus, names them. Meshes are files that end in
 {suffixes}
 
   cfr data build meshes/ --out corpus/ --unseen lamp,seat    train.h5, val.h5, test.h5
   cfr data build meshes/ --out corpus.h5                     all shapes in one file
+  cfr data build ModelNet40 --files "*/test/*" --out corpus/      ModelNet40 in OFF files
+  cfr data build psb/db --classes test.cla --out corpus.h5   the Princeton Shape Benchmark
 
 In a folder, test.h5 holds the unseen categories (half of them, by a hash of the name, unless you
 name them), val.h5 a fifth of the other shapes (by a hash of the name), train.h5 the rest. The same
@@ -94,6 +96,19 @@ def add_parser(subparsers: Commands) -> None:
         help="leave out meshes with fewer faces (20)",
     )
 
+    build.add_argument(
+        "--files",
+        metavar="PATTERN",
+        default="*",
+        help="take only meshes whose path below FOLDER is like this ('*/test/*')",
+    )
+    build.add_argument(
+        "--classes",
+        metavar="FILE.cla",
+        type=Path,
+        help="categories from a classification of the Princeton Shape Benchmark's form",
+    )
+
     open_cad = commands.add_parser(
         "open-cad",
         help="build the open corpus from Debian's packages",
@@ -138,9 +153,10 @@ def _build(args: argparse.Namespace) -> int:
         raise ValueError("--unseen: a single file has no test split; let --out be a folder")
     _check_place(args.out, single)
 
-    from cfr_jax.data.making.build import build, choose_unseen, folder_items
+    from cfr_jax.data.making.build import build, choose_unseen
+    from cfr_jax.data.making.items import folder_items
 
-    items = folder_items(args.folder, args.least_faces)
+    items = folder_items(args.folder, args.least_faces, args.files, args.classes)
     unseen: tuple[str, ...] | None = None
     if not single and args.unseen is None:
         unseen = choose_unseen([item.category for item in items])
