@@ -30,10 +30,11 @@ shapes, shapes with fewer than 20 faces (a box has 12: --least-faces), and dupli
 left_out.txt, beside the corpus, names them. Meshes are files that end in
 {suffixes}
 
-  cfr data build meshes/ --out corpus/ --unseen lamp,seat    train.h5, val.h5, test.h5
-  cfr data build meshes/ --out corpus.h5                     all shapes in one file
-  cfr data build ModelNet40 --files "*/test/*" --out corpus/      ModelNet40 in OFF files
-  cfr data build psb/db --classes test.cla --out corpus.h5   the Princeton Shape Benchmark
+  cfr data build meshes --out corpus --unseen lamp,seat      train.h5, val.h5, test.h5
+  cfr data build meshes --out corpus --unseen all            test.h5 alone
+  cfr data build meshes --out corpus.h5                      all shapes in one file
+  cfr data build ModelNet40 --files "*/test/*" --out corpus  some of the meshes
+  cfr data build psb/db --classes test.cla --out corpus      the Princeton Shape Benchmark
 
 In a folder, test.h5 holds the unseen categories (half of them, by a hash of the name, unless you
 name them), val.h5 a fifth of the other shapes (by a hash of the name), train.h5 the rest. The same
@@ -83,7 +84,7 @@ def add_parser(subparsers: Commands) -> None:
         "--out", metavar="DIR|FILE.h5", type=Path, required=True, help="where the corpus goes"
     )
     build.add_argument(
-        "--unseen", metavar="A,B,...", help="categories for test.h5 ('none' for none of them)"
+        "--unseen", metavar="A,B,...", help="categories for test.h5, or 'none', or 'all'"
     )
     build.add_argument(
         "--points", metavar="N", type=int, default=2048, help="points per shape (2048)"
@@ -157,11 +158,13 @@ def _build(args: argparse.Namespace) -> int:
     from cfr_jax.data.making.items import folder_items
 
     items = folder_items(args.folder, args.least_faces, args.files, args.classes)
+    categories = [item.category for item in items]
     unseen: tuple[str, ...] | None = None
     if not single and args.unseen is None:
-        unseen = choose_unseen([item.category for item in items])
+        unseen = choose_unseen(categories)
     elif not single:
-        unseen = () if args.unseen == "none" else tuple(args.unseen.split(","))
+        chosen = {"none": [], "all": sorted(set(categories))}
+        unseen = tuple(chosen.get(args.unseen, args.unseen.split(",")))
     _print_report(build(items, args.out, unseen, args.points), args.out)
     return 0
 
@@ -233,8 +236,8 @@ def _print_report(report: Report, out: Path) -> None:
         print(f"{split:11s} {sum(counts.values())} shapes of {categories} categories")
     from cfr_jax.data.making.build import ENOUGH
 
-    few = sum(report.counts["val"].values()) if "val" in report.counts else ENOUGH
-    if few < ENOUGH:
+    few = report.counts["val"].total() if "val" in report.counts else ENOUGH
+    if few < ENOUGH and report.counts["train"].total():
         print(f"few         {few} shapes to validate on: with fewer than {ENOUGH}, the choice of")
         print("            the best weights depends on chance; try more meshes or another --unseen")
     for why, count in report.reasons.most_common():

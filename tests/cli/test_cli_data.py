@@ -55,6 +55,16 @@ def test_a_pattern_and_a_classification_choose_the_meshes(meshes, tmp_path, caps
     assert read_corpus(out).categories == ("thing",)
 
 
+def test_all_categories_can_be_the_test(meshes, tmp_path, capsys):
+    assert run("build", meshes, "--out", tmp_path / "c", "--points", 64, "--unseen", "all") == 0
+    told = capsys.readouterr().out
+    assert "test        4 shapes of 2 categories" in told and "to validate on" not in told
+    assert sorted(path.name for path in (tmp_path / "c").iterdir()) == [
+        "shape_names.txt",
+        "test.h5",
+    ]
+
+
 def test_half_of_the_categories_are_unseen_if_none_is_named(meshes, tmp_path, capsys):
     assert run("build", meshes, "--out", tmp_path / "corpus", "--points", 64) == 0
     assert "test        2 shapes of 1 categories" in capsys.readouterr().out
