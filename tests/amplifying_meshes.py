@@ -35,6 +35,15 @@ def mesh_makers() -> dict[str, Callable[[int, random.Random], bytes]]:
         "chunks.glb": glb_chunks,
         "indices.glb": glb_indices,
         "bytes.glb": glb_bytes,
+        "meshes.g3d": g3d_meshes,
+        "indices.g3d": g3d_indices,
+        "polygon.pie": lambda size, rng: pie(1, size // 2),
+        "short polygons.pie": lambda size, rng: pie(size // 12, 3),
+        "points.pie": lambda size, rng: (
+            b"PIE 2\nPOINTS %d\n" % (size // 6) + b"1 2 3\n" * (size // 6)
+        ),
+        "levels.pie": pie_levels,
+        "newlines.pie": lambda size, rng: pie(1, 3) + rng.choice((b"\n", b" ", b" \n")) * size,
         "points.glb": lambda size, rng: glb_bytes(size, rng, mode=0),
     }  # fmt: skip
 
@@ -47,6 +56,41 @@ def off(faces: int, corners: int) -> bytes:
 def obj(faces: int, corners: int) -> bytes:
     each = b"f" + b" 1 2 3" * (corners // 3) + b" 1" * (corners % 3) + b"\n"
     return b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + each * faces
+
+
+def g3d(*meshes: bytes) -> bytes:
+    return b"G3D" + struct.pack("<BHB", 4, len(meshes), 0) + b"".join(meshes)
+
+
+def g3d_mesh(frames: int, vertices: bytes, indices: bytes) -> bytes:
+    counts = frames, len(vertices) // 12 // max(frames, 1), len(indices) // 4
+    return struct.pack("<64s3I8f2I", b"", *counts, *[0.0] * 8, 0, 0) + vertices * 2 + indices
+
+
+def g3d_meshes(size: int, rng: random.Random) -> bytes:
+    """Meshes that hold nothing, or a triangle."""
+    whole = g3d_mesh(1, _TRIANGLE, struct.pack("<3I", 0, 1, 2))
+    each = rng.choice((g3d_mesh(0, b"", b""), whole))
+    return g3d(whole, *[each] * min(size // len(each), 65_534))
+
+
+def g3d_indices(size: int, rng: random.Random) -> bytes:
+    """Faces alone, or vertices alone."""
+    if rng.random() < 0.5:
+        return g3d(g3d_mesh(1, _TRIANGLE * (size // 72), struct.pack("<3I", 0, 1, 2)))
+    return g3d(g3d_mesh(1, _TRIANGLE, struct.pack("<3I", 0, 1, 2) * (size // 12)))
+
+
+def pie(polygons: int, corners: int) -> bytes:
+    each = b"0 %d" % corners + b" 0 1 2" * (corners // 3) + b" 0" * (corners % 3) + b"\n"
+    return b"PIE 2\nPOINTS 3\n0 0 0\n1 0 0\n0 1 0\nPOLYGONS %d\n" % polygons + each * polygons
+
+
+def pie_levels(size: int, rng: random.Random) -> bytes:
+    """Levels that hold nothing, or a triangle, or no end of them."""
+    each = rng.choice((b"POINTS 0\nPOLYGONS 0\n", b"POINTS 0\n", pie(1, 3)[6:]))
+    most = rng.choice((4_999, size))
+    return pie(1, 3) + each * min(size // len(each), most)
 
 
 def stl_text(size: int, rng: random.Random, solids: bool = True) -> bytes:

@@ -25,13 +25,16 @@ Builds the corpora that networks are trained and tested on, and shows what a cor
 
 _BUILD = """\
 Turns a folder of meshes into a corpus: 2048 points per shape, drawn by area, with the normals of
-their faces, in the unit sphere. The first folder below FOLDER is the category. Flat shapes, shapes
-with fewer than 20 faces (a box has 12: --least-faces), and duplicates are left out; left_out.txt,
-beside the corpus, names them. Meshes are files that end in
+their faces, in the unit sphere. The first folder below FOLDER is the category. Damaged files, flat
+shapes, shapes with fewer than 20 faces (a box has 12: --least-faces), and duplicates are left out;
+left_out.txt, beside the corpus, names them. Meshes are files that end in
 {suffixes}
 
-  cfr data build meshes/ --out corpus/ --unseen lamp,seat    train.h5, val.h5, test.h5
-  cfr data build meshes/ --out corpus.h5                     all shapes in one file
+  cfr data build meshes --out corpus --unseen lamp,seat      train.h5, val.h5, test.h5
+  cfr data build meshes --out corpus --unseen all            test.h5 alone
+  cfr data build meshes --out corpus.h5                      all shapes in one file
+  cfr data build ModelNet40 --files "*/test/*" --out corpus  some of the meshes
+  cfr data build psb/db --classes test.cla --out corpus      the Princeton Shape Benchmark
 
 In a folder, test.h5 holds the unseen categories (half of them, by a hash of the name, unless you
 name them), val.h5 a fifth of the other shapes (by a hash of the name), train.h5 the rest. The same
@@ -81,7 +84,7 @@ def add_parser(subparsers: Commands) -> None:
         "--out", metavar="DIR|FILE.h5", type=Path, required=True, help="where the corpus goes"
     )
     build.add_argument(
-        "--unseen", metavar="A,B,...", help="categories for test.h5 ('none' for none of them)"
+        "--unseen", metavar="A,B,...", help="categories for test.h5, or 'none', or 'all'"
     )
     build.add_argument(
         "--points", metavar="N", type=int, default=2048, help="points per shape (2048)"
@@ -92,6 +95,19 @@ def add_parser(subparsers: Commands) -> None:
         type=int,
         default=20,
         help="leave out meshes with fewer faces (20)",
+    )
+
+    build.add_argument(
+        "--files",
+        metavar="PATTERN",
+        default="*",
+        help="take only meshes whose path below FOLDER is like this ('*/test/*')",
+    )
+    build.add_argument(
+        "--classes",
+        metavar="FILE.cla",
+        type=Path,
+        help="categories from a classification of the Princeton Shape Benchmark's form",
     )
 
     open_cad = commands.add_parser(
@@ -138,14 +154,17 @@ def _build(args: argparse.Namespace) -> int:
         raise ValueError("--unseen: a single file has no test split; let --out be a folder")
     _check_place(args.out, single)
 
-    from cfr_jax.data.making.build import build, choose_unseen, folder_items
+    from cfr_jax.data.making.build import build, choose_unseen
+    from cfr_jax.data.making.items import folder_items
 
-    items = folder_items(args.folder, args.least_faces)
+    items = folder_items(args.folder, args.least_faces, args.files, args.classes)
+    categories = [item.category for item in items]
     unseen: tuple[str, ...] | None = None
     if not single and args.unseen is None:
-        unseen = choose_unseen([item.category for item in items])
+        unseen = choose_unseen(categories)
     elif not single:
-        unseen = () if args.unseen == "none" else tuple(args.unseen.split(","))
+        chosen = {"none": [], "all": sorted(set(categories))}
+        unseen = tuple(chosen.get(args.unseen, args.unseen.split(",")))
     _print_report(build(items, args.out, unseen, args.points), args.out)
     return 0
 
@@ -217,8 +236,8 @@ def _print_report(report: Report, out: Path) -> None:
         print(f"{split:11s} {sum(counts.values())} shapes of {categories} categories")
     from cfr_jax.data.making.build import ENOUGH
 
-    few = sum(report.counts["val"].values()) if "val" in report.counts else ENOUGH
-    if few < ENOUGH:
+    few = report.counts["val"].total() if "val" in report.counts else ENOUGH
+    if few < ENOUGH and report.counts["train"].total():
         print(f"few         {few} shapes to validate on: with fewer than {ENOUGH}, the choice of")
         print("            the best weights depends on chance; try more meshes or another --unseen")
     for why, count in report.reasons.most_common():

@@ -174,6 +174,7 @@ class TrainingConfig:
     # all of val.h5: with 96 pairs, two flipped shapes decided which weights were best
     validation_pairs: int = 465
     keep_checkpoints: int = 2  # how many of the last ones; the best is kept as well
+    float16: bool = False  # large tensors of weights.safetensors, which is then half as large
 
     def __post_init__(self) -> None:
         # sections are made again, which checks the values that flags have set since

@@ -173,7 +173,12 @@ class _Training:
         """
         file = self.workdir / identity.WEIGHTS
         if not identity.holds(file, best):
-            save_params(file, state.average, identity.notes(self.config, best))
+            save_params(
+                file,
+                state.average,
+                identity.notes(self.config, best),
+                float16=self.config.float16,
+            )
 
     def _plan(self) -> None:
         """Measures the speed, and plans as many steps as fit into `train.minutes`."""

@@ -28,6 +28,9 @@ from cfr_jax.runtime.words import Refused, shown
 SHIPPED = Path(__file__).parent / "shipped"
 DEFAULT = "object"
 
+_LARGE = 4096  # numbers of a tensor that float16 files round
+_LARGEST_FLOAT16 = float(np.finfo(np.float16).max)
+
 
 class NoWeights(ValueError):
     """There is no such file, and no shipped weights have that name."""
@@ -48,11 +51,22 @@ class Weights:
     """All other notes in the file."""
 
 
-def save_params(path: str | Path, params: Params, notes: dict[str, str] | None = None) -> None:
+def save_params(
+    path: str | Path,
+    params: Params,
+    notes: dict[str, str] | None = None,
+    *,
+    float16: bool = False,
+) -> None:
     """Writes parameters and notes about them (strings) to a temporary file, then renames it.
 
+    With `float16`, the file is half as large: tensors of 4,096 numbers and more are rounded to
+    float16 (by at most 2^-11 of a number, or 2^-25 near zero), and `read_weights` gives them back
+    in float32. Smaller ones, such as norms and biases, stay as they are.
+
     The calibration of the parameters, if they have one, is also written as a note. Raises OSError,
-    naming the file, if it cannot be written, and ValueError for a note under a reserved name.
+    naming the file, if it cannot be written, and ValueError for a note under a reserved name or,
+    with `float16`, for a tensor with a number beyond 65,504.
     """
     path, notes = Path(path), dict(notes or {})
     for name in notes.keys() & {KEY, "sha256"}:
@@ -60,6 +74,8 @@ def save_params(path: str | Path, params: Params, notes: dict[str, str] | None =
     if (calibration := calibration_of(params)) is not None:
         notes[KEY] = calibration.write()
     tensors = {name: np.asarray(leaf) for name, leaf in _flat(params).items()}
+    if float16:
+        tensors = {name: _rounded(name, tensor) for name, tensor in tensors.items()}
     try:
         # as bytes, because a file that safetensors writes is readable only by its owner
         write_atomically(path, save(tensors, metadata=notes | {"sha256": _digest(tensors, notes)}))
@@ -81,6 +97,16 @@ def load_params(source: str | Path = DEFAULT, network: str = "cfr") -> Params:
 def shipped() -> tuple[str, ...]:
     """Names of the weights that ship with the package."""
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
+
+
+def is_ours(path: str | Path) -> bool:
+    """Whether a file has the digest that `save_params` writes; whether it fits is not checked."""
+    if Path(path).suffix != ".safetensors":
+        return False
+    try:
+        return "sha256" in _metadata(contents(path))
+    except (ValueError, AttributeError, TypeError):  # no file, or no header of such a form
+        return False
 
 
 def network_of(params: Params) -> str:
@@ -131,11 +157,28 @@ def read_weights(source: str | Path = DEFAULT, network: str | None = None) -> We
     if network not in (None, record.name):
         wanted = table.network(network).title
         raise Refused(f"{where} holds the network {record.title}, wanted {wanted}")
+    wide = {
+        name: value.astype(np.float32) if value.dtype == np.float16 else value
+        for name, value in tensors.items()
+    }
     # not jnp.asarray, which compiles a copy for each shape
-    params = jax.device_put(unflatten_dict(tensors, sep="/"))
+    params = jax.device_put(unflatten_dict(wide, sep="/"))
     if calibration is not None:
         params[KEY] = calibration
     return Weights(params, path.stem, record.name, told, notes)
+
+
+def _rounded(name: str, tensor: np.ndarray) -> np.ndarray:
+    """The tensor in float16 if it is large, otherwise itself."""
+    if tensor.dtype != np.float32 or tensor.size < _LARGE:
+        return tensor
+    largest = np.abs(tensor).max()
+    if largest > _LARGEST_FLOAT16:
+        raise ValueError(
+            f"float16: {name} holds {largest:g}, wanted at most {_LARGEST_FLOAT16:g}; "
+            "save these weights in float32"
+        )
+    return tensor.astype(np.float16)
 
 
 def _calibration(note: str | None) -> Calibration | None:
@@ -161,8 +204,8 @@ def _check_shapes(tensors: dict[str, np.ndarray], record: Network) -> None:
                 f"it does not hold {record.title}: {shown(name)} is "
                 f"{found.get(name, 'missing')}, wanted {wanted.get(name, 'no such tensor')}"
             )
-        if tensors[name].dtype != np.float32:
-            raise ValueError(f"{name} is {tensors[name].dtype}, wanted float32")
+        if tensors[name].dtype not in (np.float32, np.float16):
+            raise ValueError(f"{name} is {tensors[name].dtype}, wanted float32 or float16")
 
 
 @functools.lru_cache(maxsize=16)

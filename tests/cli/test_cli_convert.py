@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from oracle.authors import random_rpmnet_state_dict, random_state_dict
 
+from cfr_jax import align
 from cfr_jax.cli import main
+from cfr_jax.geometry import motions
 from cfr_jax.weights.authors import from_state_dict
 from cfr_jax.weights.files import SHIPPED, read_weights
 
@@ -53,6 +55,29 @@ def test_rpmnet_is_recognized_and_refused_where_our_network_is_wanted(tmp_path, 
     )
     assert main(["register", *clouds, "--weights", str(path)]) == 2
     assert "holds the network RPM-Net, wanted CFR" in capsys.readouterr().err
+
+
+def test_float16_halves_a_file_and_moves_answers_little(tmp_path):
+    # given the shipped weights, and the demo pair
+    half = tmp_path / "half.safetensors"
+    demo = SHIPPED.parents[1] / "cli" / "demo_pair"
+
+    # when
+    code = main(["convert", str(SHIPPED / "object.safetensors"), "--out", str(half), "--float16"])
+
+    # then the file keeps its notes and its calibration
+    assert code == 0
+    assert half.stat().st_size < 0.55 * (SHIPPED / "object.safetensors").stat().st_size
+    rounded, whole = read_weights(half), read_weights("object")
+    assert rounded.notes == {**whole.notes, "stored_again_from_sha256": whole.sha256}
+    assert rounded.params["calibration"] == whole.params["calibration"]
+    # and the motion that the network finds moves by less than 0.01 degrees and 0.01 of the size
+    ours, theirs = (
+        align(demo / "source.ply", demo / "target.ply", params=weights.params, refine=False)
+        for weights in (rounded, whole)
+    )
+    assert motions.angle_between(ours.transform, theirs.transform) < 0.01
+    assert np.linalg.norm(ours.transform[:3, 3] - theirs.transform[:3, 3]) < 0.01
 
 
 @pytest.mark.parametrize(

@@ -41,6 +41,30 @@ def test_unseen_categories_go_to_the_test(meshes, tmp_path, capsys):
     assert {test.categories[label] for label in test.labels} == {"chair"}
 
 
+def test_a_pattern_and_a_classification_choose_the_meshes(meshes, tmp_path, capsys):
+    out = tmp_path / "corpus.h5"
+    assert run("build", meshes, "--out", out, "--points", 64, "--files", "lamp/*") == 0
+    assert "all         2 shapes of 1 categories" in capsys.readouterr().out
+    (tmp_path / "test.cla").write_text("PSB 1\n1 3\nthing 0 3\n0 1 7\n")
+    out, classes = tmp_path / "other/corpus.h5", tmp_path / "test.cla"
+    out.parent.mkdir()
+    assert run("build", meshes, "--out", out, "--points", 64, "--classes", classes) == 0
+    told = capsys.readouterr().out
+    assert "all         2 shapes of 1 categories" in told
+    assert "left out    1: cannot be read" in told
+    assert read_corpus(out).categories == ("thing",)
+
+
+def test_all_categories_can_be_the_test(meshes, tmp_path, capsys):
+    assert run("build", meshes, "--out", tmp_path / "c", "--points", 64, "--unseen", "all") == 0
+    told = capsys.readouterr().out
+    assert "test        4 shapes of 2 categories" in told and "to validate on" not in told
+    assert sorted(path.name for path in (tmp_path / "c").iterdir()) == [
+        "shape_names.txt",
+        "test.h5",
+    ]
+
+
 def test_half_of_the_categories_are_unseen_if_none_is_named(meshes, tmp_path, capsys):
     assert run("build", meshes, "--out", tmp_path / "corpus", "--points", 64) == 0
     assert "test        2 shapes of 1 categories" in capsys.readouterr().out
@@ -60,6 +84,11 @@ def test_half_of_the_categories_are_unseen_if_none_is_named(meshes, tmp_path, ca
         (["build", "{meshes}", "--out", "{tmp}/c", "--unseen", "sofa"], "unseen: no mesh .*sofa"),
         (["build", "{meshes}", "--out", "{tmp}/c.h5", "--points", "3"], "--points: got 3"),
         (["build", "{tmp}/none", "--out", "{tmp}/c.h5"], "no folder"),
+        (["build", "{meshes}", "--out", "{tmp}/c.h5", "--files", "a*"], "files: none of 4 meshes"),
+        (
+            ["build", "{meshes}", "--out", "{tmp}/c.h5", "--classes", "{tmp}/a.cla"],
+            "classes: .*a.cla",
+        ),
         (["open-cad", "--out", "{tmp}/c", "--debs", "{tmp}/none"], "--debs: there is no folder"),
         (["open-cad", "--out", "{tmp}/c", "--debs", "{tmp}"], "--debs: no 0ad-data"),
         (["open-cad", "--out", "{tmp}/c", "--compare", "{tmp}"], "--compare: no .h5 file"),

@@ -4,8 +4,9 @@ import pytest
 
 from cfr_jax.data.corpus import read_corpus
 from cfr_jax.data.making import build as building
-from cfr_jax.data.making.build import build, choose_unseen, folder_items, split_of
+from cfr_jax.data.making.build import build, choose_unseen, split_of
 from cfr_jax.data.making.difference import compare
+from cfr_jax.data.making.items import folder_items
 from cfr_jax.data.making.samples import Item
 
 POINTS = 600
@@ -80,11 +81,11 @@ def test_points_lie_on_the_mesh_they_are_named_after(meshes, tmp_path):
 def test_meshes_that_are_left_out_are_listed_with_their_reason(meshes, tmp_path):
     report = make(meshes, tmp_path / "corpus")
     assert report.left_out == {
-        "lamp/broken.off": "cannot be read",
+        "lamp/broken.off": "cannot be read: line 2: the file ends after 0 of 3 vertices",
         "table/small.off": "fewer than 20 faces with an area",
         "lamp/twice.obj": "repeats lamp/deep/4.off",
     }
-    assert report.reasons["repeats another"] == 1
+    assert report.reasons["repeats another"] == report.reasons["cannot be read"] == 1
     lines = report.left_out_file.read_text().splitlines()
     assert lines == [f"{name}: {why}" for name, why in sorted(report.left_out.items())]
 
@@ -148,6 +149,35 @@ def test_one_file_holds_all(meshes, tmp_path):
     assert len(read_corpus(tmp_path / "all.h5")) == report.shapes == 12
     beside = ["all.h5", "all.left_out.txt", "shape_names.txt"]
     assert sorted(path.name for path in tmp_path.iterdir()) == beside
+
+
+def test_an_older_build_is_replaced_whole_or_not_at_all(meshes, tmp_path, monkeypatch):
+    # given a corpus with a test split
+    out = tmp_path / "corpus"
+    make(meshes, out)
+    before = contents(out)
+
+    # when another build fails while it writes, then the older one is as it was
+    with monkeypatch.context() as patched:
+        patched.setattr(building, "_write_corpus", lambda path, *_: path.touch() or 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            make(meshes, out, unseen=())
+    assert contents(out) == before
+
+    # and when it succeeds, nothing of the older one is left
+    make(meshes, out, unseen=())
+    assert "test.h5" in before and not (out / "test.h5").exists()
+    make(meshes, tmp_path / "fresh", unseen=())
+    assert contents(out) == contents(tmp_path / "fresh")
+
+
+def test_a_single_file_does_not_rename_the_categories_of_its_neighbors(meshes, tmp_path):
+    make(meshes, tmp_path / "all.h5", unseen=None)
+    make(meshes, tmp_path / "again.h5", unseen=None)
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match="out: .*shape_names.txt gives a.*.h5 other categories"):
+        make(meshes / "lamp", tmp_path / "lamps.h5", unseen=None)
+    assert contents(tmp_path) == before
 
 
 def test_meshes_without_subfolders_form_one_category(tmp_path):

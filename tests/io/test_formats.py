@@ -15,7 +15,7 @@ import pytest
 from cfr_jax.cli import main
 from cfr_jax.cli.shared import report
 from cfr_jax.data.layout import recognize
-from cfr_jax.data.making.build import folder_items
+from cfr_jax.data.making.items import folder_items
 from cfr_jax.io import CloudFileError, PointCloud, as_point_cloud, formats, read, write
 from cfr_jax.io.formats import Format
 from cfr_jax.io.mesh import Mesh

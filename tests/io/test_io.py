@@ -26,7 +26,7 @@ WITH_NORMALS = (
 )  # fmt: skip
 MESHES = (
     "box_text.ply", "box.ply", "mixed.ply", "mixed_text.ply", "box.off", "box.obj", "box.stl",
-    "box_text.stl", "box.glb", "moved.gltf",
+    "box_text.stl", "box.glb", "moved.gltf", "box.g3d", "box.pie",
 )  # fmt: skip
 
 

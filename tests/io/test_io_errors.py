@@ -34,6 +34,10 @@ def refusal(path) -> str:
     return message.removeprefix(f"{path}: ")
 
 
+PIE = "PIE 2\nTYPE 200\nLEVELS 1\nLEVEL 1\n"
+TRIANGLE = PIE.replace("LEVEL 1\n", "") + "POINTS 3\n0 0 0\n1 0 0\n0 1 0\nPOLYGONS 1\n"
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("content", [b"", b"\n\n", b"\x00\xff" * 53, b"not a cloud\n", b"{}"])
 def test_what_is_no_cloud_is_refused_in_every_format(suffix, content, tmp_path):
@@ -113,6 +117,19 @@ def test_an_unknown_suffix_is_answered_with_the_known_ones(tmp_path):
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2\n", "promises 4 corners"),
         ("a.obj", "v 0 0 0\nv 1 0\nf 1 2 3\n", "line 2"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 0\n", "names vertex -1"),
+        (
+            "a.pie",
+            PIE + "POINTS 3\n0 0 0\n1 0 0\nPOLYGONS 0\n",
+            "line 8: they end after 2 of 3 poi",
+        ),
+        ("a.pie", TRIANGLE + "200 3 0 1\n", "promises 3 corners, its line holds 2"),
+        ("a.pie", TRIANGLE + "200 3 0 1 3\n", "behind line 7: a polygon names vertex 3 or 0, want"),
+        ("a.pie", TRIANGLE + "G00 3 0 1 2\n", "behind line 7: a polygon does not begin with its"),
+        ("a.pie", TRIANGLE + "200\n", "does not begin with its flags"),
+        ("a.pie", TRIANGLE.replace("LEVELS 1", "LEVELS 2") + "200 3 0 1 2\n", "1 of 2 levels"),
+        ("a.pie", PIE.replace("PIE 2", "PIE 5"), "starts with b'PIE 5.*, wanted 'PIE 2'"),
+        ("a.pie", PIE + "POINTS 1\n0 0\n", "2 coordinates, wanted three"),
+        ("a.pie", PIE.replace("LEVELS 1\n", ""), "no line 'POINTS n'"),
         ("a.stl", "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n", "line 2: .*facet"),
     ],
 )
@@ -128,6 +145,8 @@ def test_headers_that_promise_more_than_the_file_holds_are_refused_at_once(tmp_p
     las[107:111] = struct.pack("<I", 4_000_000_000)
     stl = bytearray(samples["box.stl"].read_bytes())
     stl[80:84] = struct.pack("<I", 4_000_000_000)
+    g3d = bytearray(samples["box.g3d"].read_bytes())
+    g3d[75:79] = struct.pack("<I", 4_000_000_000)
     npy = samples["plain.npy"].read_bytes().replace(b"(60, 6)", b"(60000000000, 6)")
     binary = pcd("binary").replace(b"WIDTH 60", b"WIDTH 6000000000")
     promises = {
@@ -136,11 +155,31 @@ def test_headers_that_promise_more_than_the_file_holds_are_refused_at_once(tmp_p
         "p.las": bytes(las),
         "p.stl": bytes(stl),
         "p.npy": npy,
+        "p.g3d": bytes(g3d),
+        "p.pie": samples["box.pie"].read_bytes().replace(b"POINTS 8", b"POINTS 800000000"),
     }
     for name, data in promises.items():
         (tmp_path / name).write_bytes(data)
         # then
         assert "00000" in refusal(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "told"),
+    [
+        (3, "<B", "version 3, wanted 4"),
+        (4, "<H", "bytes stand behind 1 meshes"),
+        (71, "<I", "mesh 0 has 0 frames"),
+        (79, "<I", "wanted at least one frame and a multiple of three"),
+        (-4, "<I", "mesh 1: a face names vertex 9, wanted 0 to 7"),
+    ],
+)
+def test_a_g3d_that_contradicts_itself_is_refused(place, value, told, tmp_path):
+    data = bytearray(write_meshes(tmp_path)["box.g3d"].read_bytes())
+    number = {3: 3, 4: 1, 71: 0, 79: 14, -4: 9}[place]
+    struct.pack_into(value, data, place % len(data), number)
+    (tmp_path / "a.g3d").write_bytes(data)
+    assert told in refusal(tmp_path / "a.g3d")
 
 
 @pytest.mark.parametrize("value", [1e30, np.inf, -np.inf, np.nan])

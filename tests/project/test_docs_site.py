@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -83,3 +84,26 @@ def test_the_answers_to_what_users_ask_are_all_there():
     for row in rows:
         shown = row.rstrip("| ").rpartition("|")[2]
         assert re.fullmatch(r" `cfr [^`]+`", shown), row
+
+
+def test_the_summary_of_the_results_is_made_of_the_tables_below_it():
+    pytest.importorskip("matplotlib", reason="the figure needs the viz extra")
+    made = runpy.run_path(str(ROOT / "docs" / "summary.py"))
+    text = (ROOT / "docs" / "results.md").read_text("utf-8")
+    written = text.partition(made["BEGIN"])[2].partition(made["END"])[0]
+    assert written == made["in_markdown"](made["summary"](text))
+    assert len(written.splitlines()) > 12
+
+
+def test_every_measured_number_of_the_comparison_is_in_the_results():
+    """Rounded there as here; the published numbers stand in a column of their own."""
+    results = (ROOT / "docs" / "results.md").read_text("utf-8")
+    known = {float(number) for number in re.findall(r"\d+\.\d+|\d+", results)}
+    text = (ROOT / "docs" / "comparison.md").read_text("utf-8")
+    table = text.partition("| method | published")[2].partition("\n\n")[0]
+    measured = [line.strip("|").split("|")[2] for line in table.splitlines()[2:]]
+    numbers = re.findall(r"\d+\.\d+|\d+", re.sub(r"`[^`]*`", "", " ".join(measured)))
+    assert len(numbers) > 20
+    for number in numbers:
+        half = 0.51 / 10 ** len(number.partition(".")[2])
+        assert any(abs(each - float(number)) < half for each in known), number

@@ -180,6 +180,22 @@ def test_a_run_leaves_its_measurements_its_weights_and_a_page(whole):
     assert f"step {best['step']}" in page and "http" not in page and page.count("<svg") == 8
 
 
+def test_weights_are_stored_in_float16_if_the_config_says_so(corpus_file, tmp_path, whole):
+    # given
+    given = config(corpus_file)
+    given.float16 = True
+
+    # when
+    run(given, tmp_path)
+
+    # then they are those of the same run in float32, rounded
+    small, large = (folder / "weights.safetensors" for folder in (tmp_path, whole[0]))
+    assert small.stat().st_size < 0.6 * large.stat().st_size
+    for a, b in zip(jax.tree.leaves(load_params(small)), jax.tree.leaves(load_params(large)),
+                    strict=True):  # fmt: skip
+        np.testing.assert_allclose(a, b, rtol=2**-10, atol=2**-25)
+
+
 def test_a_checkpoint_says_all_that_a_run_needs(whole):
     newest = max((whole[0] / "checkpoints").iterdir(), key=lambda path: int(path.name))
 

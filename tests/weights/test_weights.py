@@ -12,6 +12,7 @@ from safetensors.numpy import load_file, save_file
 from cfr_jax.networks import rpmnet
 from cfr_jax.networks.cfr.modules import init_params
 from cfr_jax.networks.probability import KEY, Calibration, calibration_of
+from cfr_jax.networks.table import network
 from cfr_jax.weights.files import load_params, network_of, read_weights, save_params, shipped
 
 
@@ -200,6 +201,61 @@ def test_every_shipped_file_is_sound():
 
         assert found.name == name
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found.params))
+
+
+def test_float16_rounds_large_tensors_alone_and_halves_the_file(fresh, saved, tmp_path):
+    # given
+    path = tmp_path / "half.safetensors"
+
+    # when
+    save_params(path, fresh, {"made_by": "a test"}, float16=True)
+
+    # then
+    found = flatten_dict(read_weights(path).params, sep="/")
+    for name, wanted in flatten_dict(fresh, sep="/").items():
+        given, wanted = np.asarray(found[name]), np.asarray(wanted)
+        assert given.dtype == np.float32
+        if wanted.size < 4096:
+            np.testing.assert_array_equal(given, wanted)
+        else:  # half a unit in the last of 11 digits, or of the smallest number
+            assert (np.abs(given - wanted) <= np.maximum(np.abs(wanted) * 2**-11, 2**-25)).all()
+            assert (given != wanted).any()
+    assert path.stat().st_size < 0.55 * saved.stat().st_size
+    # what was rounded once is not rounded again
+    save_params(tmp_path / "again.safetensors", read_weights(path).params, float16=True)
+    again = read_weights(tmp_path / "again.safetensors").params
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, again, read_weights(path).params))
+
+
+def test_any_flipped_bit_of_a_float16_file_is_noticed(fresh, tmp_path):
+    path = tmp_path / "half.safetensors"
+    save_params(path, fresh, float16=True)
+    content = bytearray(path.read_bytes())
+    rng = np.random.default_rng(1)
+    for place in rng.integers(0, len(content), 200):
+        content[place] ^= 4
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="^weights: "):
+            read_weights(path)
+        content[place] ^= 4
+
+
+def test_numbers_beyond_float16_are_refused_by_name_and_nothing_is_written(fresh, tmp_path):
+    tree = jax.tree.map(np.array, fresh)
+    tree["cascade"]["kernel"][0, 0, 0] = -65_536.0
+    with pytest.raises(ValueError, match="float16: cascade/kernel holds 65536, wanted at most 655"):
+        save_params(tmp_path / "half.safetensors", tree, float16=True)
+    assert not list(tmp_path.iterdir())
+    # in float32 they are fine
+    save_params(tmp_path / "whole.safetensors", tree)
+    assert read_weights(tmp_path / "whole.safetensors").params["cascade"]["kernel"].min() == -65_536
+
+
+def test_the_largest_baseline_takes_less_than_twelve_megabytes(tmp_path):
+    path = tmp_path / "dcp.safetensors"
+    save_params(path, jax.jit(network("dcp").fresh)(jax.random.key(0)), float16=True)
+    assert read_weights(path).network == "dcp"
+    assert path.stat().st_size < 12e6
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

@@ -5,23 +5,20 @@ The output depends only on the meshes and their names.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from cfr_jax.data.making.duplicates import drop_duplicates
-from cfr_jax.data.making.mesh_formats import mesh_formats
-from cfr_jax.data.making.meshes import read_mesh
 from cfr_jax.data.making.samples import RECIPE, Item, sampled
 from cfr_jax.data.making.shapes import Shape, name_share
-from cfr_jax.io.formats import by_suffix
-from cfr_jax.runtime.atomic import unfinished, write_atomically
+from cfr_jax.runtime.atomic import unfinished
 from cfr_jax.runtime.progress import Progress
 
 VALIDATION_SHARE = 0.2
@@ -43,44 +40,14 @@ class Report:
 
     @property
     def reasons(self) -> Counter[str]:
-        """How many shapes were left out for each reason. All `repeats OTHER` count as one."""
+        """How many shapes were left out for each reason.
+
+        All that repeat another count as one, and so do all that cannot be read.
+        """
         return Counter(
-            "repeats another" if why.startswith("repeats ") else why
+            "repeats another" if why.startswith("repeats ") else why.partition(": ")[0]
             for why in self.left_out.values()
         )
-
-
-def folder_items(folder: Path, least_faces: int = 20) -> list[Item]:
-    """Every mesh in a folder and its subfolders.
-
-    Its category is the name of the top-level subfolder, or of the folder itself if it lies there.
-    Raises ValueError if there is no mesh.
-    """
-    if not folder.is_dir():
-        raise ValueError(f"folder: there is no folder {folder} to take meshes from")
-    suffixes = by_suffix(mesh_formats())
-    paths = sorted(
-        path for path in folder.rglob("*") if path.suffix.lower() in suffixes and path.is_file()
-    )
-    if not paths:
-        raise ValueError(
-            f"folder: no mesh below {folder}, wanted files that end in {' '.join(suffixes)}"
-        )
-    items = []
-    for path in paths:
-        inside = path.relative_to(folder)
-        category = inside.parts[0] if len(inside.parts) > 1 else folder.resolve().name
-        stat = path.stat()
-        items.append(
-            Item(
-                name=inside.as_posix(),
-                category=category,
-                load=partial(read_mesh, path),
-                least_faces=least_faces,
-                stamp=f"{stat.st_size} {stat.st_mtime_ns}",
-            )
-        )
-    return items
 
 
 def choose_unseen(categories: Sequence[str]) -> tuple[str, ...]:
@@ -113,8 +80,11 @@ def build(
     to them, and also `left_out.txt` (`NAME.left_out.txt` for a single file), which says what was
     left out and why.
 
-    Labels are indices into the sorted `categories`, by default those that occur. Raises ValueError
-    if no item is fit, if items share a name, or if an unseen category has no mesh.
+    Labels are indices into the sorted `categories`, by default those that occur. All files are
+    written beside their place and moved there at the end. Those of an older build are then removed,
+    so that a folder never mixes the two. Raises ValueError if no item is fit, if items share a
+    name, if an unseen category has no mesh, or if a single file would give other corpora in its
+    folder other categories.
     """
     categories = sorted(set(categories or ()) | {item.category for item in items})
     unknown = sorted(set(unseen or ()) - set(categories))
@@ -125,6 +95,12 @@ def build(
         raise ValueError(
             f"items: {len(repeated)} names occur twice, such as {repeated[0]!r}; wanted unique ones"
         )
+
+    single = unseen is None
+    folder = out.parent if single else out
+    names = "".join(f"{name}\n" for name in categories)
+    if single:
+        _check_neighbors(out, names)
 
     held_back = frozenset(unseen or ())
     work = out.with_name(f".{out.name}.work")
@@ -154,29 +130,45 @@ def build(
             f"items: none of {len(items)} meshes is fit for a corpus: {dict(report.reasons)}"
         )
 
-    single = unseen is None
-    folder = out.parent if single else out
     folder.mkdir(parents=True, exist_ok=True)
-    names = "".join(f"{name}\n" for name in categories)
-    write_atomically(folder / "shape_names.txt", names.encode())
-    for split in ("all",) if single else SPLITS:
-        chosen = [
-            row for row in rows
-            if single or split == split_of(kept[row].name, kept[row].category in held_back)
-        ]  # fmt: skip
-        report.counts[split] = Counter(kept[row].category for row in chosen)
-        if chosen:  # a corpus needs at least one shape
-            path = out if single else out / f"{split}.h5"
-            _write_corpus(path, [kept[row] for row in chosen], [shapes[row] for row in chosen],
-                          categories, split)  # fmt: skip
-    left_out = folder / (f"{out.stem}.left_out.txt" if single else "left_out.txt")
-    left_out.unlink(missing_ok=True)
-    if report.left_out:
-        lines = (f"{name}: {why}\n" for name, why in sorted(report.left_out.items()))
-        write_atomically(left_out, "".join(lines).encode())
-        report.left_out_file = left_out
+    fresh = folder / f".{out.name}.new"
+    shutil.rmtree(fresh, ignore_errors=True)
+    fresh.mkdir()
+    try:
+        (fresh / "shape_names.txt").write_text(names, "utf-8")
+        for split in ("all",) if single else SPLITS:
+            chosen = [
+                row for row in rows
+                if single or split == split_of(kept[row].name, kept[row].category in held_back)
+            ]  # fmt: skip
+            report.counts[split] = Counter(kept[row].category for row in chosen)
+            if chosen:  # a corpus needs at least one shape
+                path = fresh / (out.name if single else f"{split}.h5")
+                _write_corpus(path, [kept[row] for row in chosen], [shapes[row] for row in chosen],
+                              categories, split)  # fmt: skip
+        left_out = f"{out.stem}.left_out.txt" if single else "left_out.txt"
+        if report.left_out:
+            lines = (f"{name}: {why}\n" for name, why in sorted(report.left_out.items()))
+            (fresh / left_out).write_text("".join(lines), "utf-8")
+            report.left_out_file = folder / left_out
+        for name in (left_out, *([out.name] if single else [f"{split}.h5" for split in SPLITS])):
+            (folder / name).unlink(missing_ok=True)
+        for path in sorted(fresh.iterdir()):
+            os.replace(path, folder / path.name)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
     shutil.rmtree(work, ignore_errors=True)
     return report
+
+
+def _check_neighbors(out: Path, names: str) -> None:
+    """Raises ValueError if other files in the folder number their categories otherwise."""
+    listed = out.parent / "shape_names.txt"
+    others = [path.name for path in out.parent.glob("*.h5") if path.name != out.name]
+    if others and listed.is_file() and listed.read_bytes() != names.encode():
+        raise ValueError(
+            f"out: {listed} gives {others[0]} other categories, wanted a folder without corpora"
+        )
 
 
 def _write_corpus(

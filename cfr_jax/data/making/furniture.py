@@ -66,7 +66,7 @@ class FurnitureLibrary:
 
     def mesh(self, piece: Piece) -> Mesh:
         """The model of a piece, in the units of its file (see `Piece.scaled`)."""
-        shape = parse_obj(_model(self._zip, piece.model, self.path), piece.identifier)
+        shape = parse_obj(_model(self._zip, piece.model), piece.identifier)
         if not isinstance(shape, Mesh):
             raise ValueError(f"{piece.identifier}: has no faces, wanted a mesh")
         return shape
@@ -105,7 +105,7 @@ def _unescaped(match: re.Match[str]) -> str:
     return chr(int(code[1:], 16)) if len(code) == 5 else code
 
 
-def _model(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
+def _model(archive: zipfile.ZipFile, name: str) -> bytes:
     try:
         data = _content(archive, name)
         if not zipfile.is_zipfile(io.BytesIO(data)) or name.lower().endswith(".obj"):
@@ -113,10 +113,10 @@ def _model(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
         with zipfile.ZipFile(io.BytesIO(data)) as nested:
             models = [inner for inner in nested.namelist() if inner.lower().endswith(".obj")]
             if not models:
-                raise ValueError(f"{path}: {name} holds no OBJ file")
+                raise ValueError(f"{name} holds no OBJ file")
             return _content(nested, models[0])
     except (KeyError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: cannot read {name}: {error}") from error
+        raise ValueError(f"cannot read {name}: {error}") from error
 
 
 def _content(archive: zipfile.ZipFile, name: str) -> bytes:

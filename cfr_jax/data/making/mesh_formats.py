@@ -1,6 +1,7 @@
 """Formats that corpora are made from: all surface formats of the table, and two formats of games.
 
-The formats of games are read only to build corpora, because their parsers trust the packages.
+These two are read only to build corpora: their parsers refuse damaged files, but keep no budget of
+memory and time, as `cfr_jax.io` does.
 """
 
 from __future__ import annotations

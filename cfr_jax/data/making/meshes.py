@@ -13,11 +13,14 @@ from jaxtyping import Float64, Int64
 
 from cfr_jax.data.making.mesh_formats import mesh_formats
 from cfr_jax.geometry import motions
+from cfr_jax.io.cloud import as_float64
 from cfr_jax.io.files import read_shape
 from cfr_jax.io.mesh import Mesh, fan_triangles
+from cfr_jax.runtime.words import shown
 
 _PMD_START = struct.Struct("<4sIIII")  # magic, version, size of the rest, vertices, texture sets
 _PMD_COUNT = struct.Struct("<I")
+_DEEPEST = 100  # levels of objects within objects in AC3D
 
 
 def parse_pmd(data: bytes, name: str) -> Mesh:
@@ -43,8 +46,7 @@ def parse_pmd(data: bytes, name: str) -> Mesh:
     triangles = np.frombuffer(data, "<u2", 3 * faces, start).reshape(-1, 3).astype(np.int64)
     if faces and triangles.max() >= count:
         raise ValueError(f"{name}: a face names vertex {triangles.max()} of {count}")
-    vertices = rows["position"].astype(np.float64)
-    normals = rows["normal"].astype(np.float64)
+    vertices, normals = as_float64(rows["position"]), as_float64(rows["normal"])
     return Mesh(vertices, _turned(vertices, triangles, normals), name)
 
 
@@ -88,8 +90,10 @@ class _Ac3d:
         self.vertices: list[np.ndarray] = []
         self.polygons: list[list[int]] = []  # corners, numbered over all objects
 
-    def read_object(self, parent: Float64[np.ndarray, "4 4"]) -> None:
+    def read_object(self, parent: Float64[np.ndarray, "4 4"], depth: int = 0) -> None:
         """Reads the next OBJECT and its children. MATERIAL lines before it are skipped."""
+        if depth > _DEEPEST:
+            self._fail(f"wanted objects within at most {_DEEPEST} others")
         # Some exporters drop an object without reducing the number of children. The file then ends
         # early.
         if not any(self._lines[self._at :]):
@@ -117,7 +121,7 @@ class _Ac3d:
                         self._read_surface(first, count)
                 case ["kids", number]:
                     for _ in range(self._count(number)):
-                        self.read_object(parent @ local)
+                        self.read_object(parent @ local, depth + 1)
                     return
                 case ["OBJECT", *_]:
                     self._fail("wanted 'kids' before the next OBJECT")
@@ -125,7 +129,8 @@ class _Ac3d:
                     pass
 
     def _place(self, points: np.ndarray, motion: Float64[np.ndarray, "4 4"]) -> None:
-        self.vertices.append(motions.apply(motion, points))
+        with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers are removed later
+            self.vertices.append(motions.apply(motion, points))
         self._seen += len(points)
 
     def _read_surface(self, first: int, count: int) -> None:
@@ -187,9 +192,14 @@ class _Ac3d:
 def read_mesh(path: Path) -> Mesh:
     """Reads the triangles of a file. Its suffix gives the format, one of `mesh_formats`.
 
-    Raises ValueError if the file cannot be read or holds points but no faces.
+    Raises ValueError if the file cannot be read or holds points but no faces. The message does not
+    name the file, so that it is the same wherever the file lies.
     """
-    mesh = read_shape(path, mesh_formats())
+    try:
+        mesh = read_shape(path, mesh_formats())
+    except ValueError as error:
+        why = str(error).removeprefix(f"{shown(path)}: ").removeprefix(f"{path.name}: ")
+        raise ValueError(why) from error
     if not isinstance(mesh, Mesh):
-        raise ValueError(f"{path}: got a point cloud, wanted a mesh with faces")
+        raise ValueError("got a point cloud, wanted a mesh with faces")
     return mesh

@@ -100,12 +100,14 @@ def build_open_cad(out: Path, debs: Path | None = None, quiet: bool = False) -> 
         items.sort(key=lambda item: item.name)
         report = build(items, out, UNSEEN, quiet=quiet, categories=categories())
     seen = [category for category in categories() if category not in UNSEEN]
-    (out / "seen_categories.txt").write_text("".join(f"{name}\n" for name in seen))
-    (out / "unseen_categories.txt").write_text("".join(f"{name}\n" for name in UNSEEN))
-    (out / "left_out.tsv").write_text(
-        "".join(f"{name}\t{why}\n" for name, why in sorted(report.left_out.items()))
-    )
-    (out / "CREDITS.md").write_text(credits_text(versions))
+    left_out = "".join(f"{name}\t{why}\n" for name, why in sorted(report.left_out.items()))
+    for name, text in (
+        ("seen_categories.txt", "".join(f"{name}\n" for name in seen)),
+        ("unseen_categories.txt", "".join(f"{name}\n" for name in UNSEEN)),
+        ("left_out.tsv", left_out),
+        ("CREDITS.md", credits_text(versions)),
+    ):
+        write_atomically(out / name, text.encode())
     shutil.rmtree(work, ignore_errors=True)
     return report
 

@@ -64,8 +64,9 @@ def _attempt(item: Item, points: int, bar: Progress) -> Shape | str:
     except Unfit as unfit:
         return str(unfit)
     except ValueError as error:
-        bar.write(f"left out: {error}") if not bar.disable else None
-        return "cannot be read"
+        why = " ".join(str(error).removeprefix(f"{item.name}: ").split())
+        bar.write(f"left out: {item.name}: {why}") if not bar.disable else None
+        return f"cannot be read: {why}"
     finally:
         bar.update(1)
 

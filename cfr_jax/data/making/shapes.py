@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 from scipy.spatial import cKDTree
 
+from cfr_jax.io.cloud import as_float64
 from cfr_jax.io.mesh import Mesh, areas_and_normals, sample_triangles
 
 FLATTEST = 0.05  # minimum ratio of the smallest extent to the largest
@@ -79,7 +80,7 @@ def name_share(name: str, purpose: str) -> float:
 def clean_triangles(mesh: Mesh) -> Float64[np.ndarray, "t 3 3"]:
     """Corners of the triangles that are finite and have an area. Raises `Unfit` if there are none
     or if the mesh is broken."""
-    vertices = np.asarray(mesh.vertices, np.float64).reshape(-1, 3)
+    vertices = as_float64(mesh.vertices).reshape(-1, 3)
     triangles = mesh.triangles
     if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
         raise Unfit("a face names a vertex that is not there")

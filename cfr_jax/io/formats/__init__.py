@@ -126,6 +126,8 @@ _FORMATS: list[Format] = [
     Format("STL", (".stl",), "surface", _here("meshes.stl", "parse")),
     Format("GLB", (".glb",), "surface", _here("meshes.gltf", "parse_glb"), needs_folder=True),
     Format("glTF", (".gltf",), "surface", _here("meshes.gltf", "parse_gltf"), needs_folder=True),
+    Format("G3D", (".g3d",), "surface", _here("meshes.g3d", "parse"), note="Megaglest"),
+    Format("PIE", (".pie",), "surface", _here("meshes.pie", "parse"), note="Warzone 2100"),
 ]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -12,6 +12,7 @@ from cfr_jax.io.budget import POINT, check_surface
 from cfr_jax.io.cloud import CloudFileError, PointCloud
 from cfr_jax.io.formats.text.lines import (
     Lines,
+    Ragged,
     Text,
     behind_mark,
     block_end,
@@ -55,8 +56,21 @@ def parse_off(data: bytes, name: str) -> Mesh:
 
 def _off_triangles(rows: Lines, table: np.ndarray) -> Int64[np.ndarray, "t 3"]:
     triangles = Growing("i8", 3)
+    for corners, sizes in polygons_of(rows.ragged(), rows.count):
+        append_polygons(triangles, corners, sizes, table.nbytes // POINT, len(rows.data))
+    return triangles.joined()
+
+
+def polygons_of(
+    rows: Iterable[Ragged], count: int
+) -> Iterator[tuple[Float64[np.ndarray, " k"], Int64[np.ndarray, " r"]]]:
+    """The corners of all polygons of a block, and how many each polygon has.
+
+    Each of the `count` rows is a number of corners, the corners, and perhaps colors or the like,
+    which are left out.
+    """
     face = 0
-    for block in rows.ragged():
+    for block in rows:
         values, counts = block.values, block.counts
         starts = np.cumsum(counts) - counts
         sizes, room = values[starts], counts - 1
@@ -64,22 +78,22 @@ def _off_triangles(rows: Lines, table: np.ndarray) -> Int64[np.ndarray, "t 3"]:
         if not good.all():
             bad = int(np.argmin(good))
             raise CloudFileError(
-                f"face {face + bad} of {rows.count} promises {sizes[bad]:g} corners, its line "
+                f"face {face + bad} of {count} promises {sizes[bad]:g} corners, its line "
                 f"holds {room[bad]}"
             )
-        # Colors may stand behind the corners.
         place = np.arange(len(values)) - np.repeat(starts, counts)
         corners = values[(place > 0) & (place <= np.repeat(sizes, counts))]
-        _append(triangles, corners, sizes.astype(np.int64), table.nbytes // POINT, rows.data)
+        yield corners, sizes.astype(np.int64)
         face += len(counts)
-    return triangles.joined()
+    if face < count:
+        raise CloudFileError(f"{count - face} of {count} faces have no corners")
 
 
-def _append(
-    triangles: Growing, corners: np.ndarray, sizes: np.ndarray, vertices: int, data: bytes
+def append_polygons(
+    triangles: Growing, corners: np.ndarray, sizes: np.ndarray, vertices: int, size: int
 ) -> None:
-    """Adds the triangles of a block of polygons, if there is room for them."""
-    check_surface(vertices, len(triangles) + triangles_within(sizes), len(data))
+    """Adds the triangles of a block of polygons, if a file of `size` bytes has room for them."""
+    check_surface(vertices, len(triangles) + triangles_within(sizes), size)
     triangles.append(fan_triangles(corners, sizes, len(triangles)))
 
 
@@ -109,7 +123,7 @@ def parse_obj(data: bytes, name: str) -> Mesh | PointCloud:
             seen = np.repeat(before + np.cumsum(vertex)[face], sizes)
             corners = np.where(corners < 0, corners + seen, corners - 1)
             faces += len(sizes)
-            _append(triangles, corners, sizes, len(points), data)
+            append_polygons(triangles, corners, sizes, len(points), len(data))
     if len(points) == 0:
         raise CloudFileError("holds no line 'v x y z', wanted three at least")
     if faces == 0:

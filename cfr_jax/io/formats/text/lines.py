@@ -104,22 +104,28 @@ class Lines:
 
 
 class Text:
-    """A text whose filled lines are taken one after the other.
+    """A text, or its part from `begin` to `end`, whose filled lines are taken one after the other.
 
     What follows a `#` is left out if there may be `comments`.
     """
 
     def __init__(
-        self, data: bytes, begin: int = 0, first: int = 1, *, comments: bool = False
+        self,
+        data: bytes,
+        begin: int = 0,
+        first: int = 1,
+        *,
+        end: int | None = None,
+        comments: bool = False,
     ) -> None:
-        self._data, self._comments = data, comments
+        self._data, self._end, self._comments = data, end, comments
         self._at, self._line = begin, first
 
     def take(self, count: int, what: str) -> Lines:
         """The next `count` filled lines; an error if they are not all there."""
         begin, first, left = self._at, self._line, count
         while left:
-            for line, block in blocks(self._data, self._at, None, self._line, self._comments):
+            for line, block in blocks(self._data, self._at, self._end, self._line, self._comments):
                 starts = filled_starts(block)
                 if len(starts) > left:  # stops where the next filled line begins
                     end = int(starts[left])
@@ -133,14 +139,15 @@ class Text:
                 if not left:
                     break
             else:
+                what_ends = "the file ends" if self._end is None else "they end"
                 raise CloudFileError(
-                    f"line {self._line}: the file ends after {count - left} of {count} {what}"
+                    f"line {self._line}: {what_ends} after {count - left} of {count} {what}"
                 )
         return Lines(self._data, begin, self._at, first, count, self._comments)
 
     def left(self) -> int:
         """How many filled lines there are from here on."""
-        found = blocks(self._data, self._at, None, self._line, self._comments)
+        found = blocks(self._data, self._at, self._end, self._line, self._comments)
         return sum(len(filled_starts(block)) for _, block in found)
 
 
