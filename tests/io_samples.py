@@ -11,6 +11,7 @@ import laspy
 import numpy as np
 import plyfile
 import trimesh
+from game_samples import g3d, pie
 
 COUNT = 60
 
@@ -158,8 +159,8 @@ def write_meshes(folder: Path) -> dict[str, Path]:
     put("box_text.stl", box.export(file_type="stl_ascii").encode())
     put("box.glb", trimesh.Scene(box).export(file_type="glb"))
     put("moved.gltf", moved_gltf())
-    put("box.g3d", box_g3d())
-    put("box.pie", box_pie())
+    put("box.g3d", g3d(box.vertices, box.faces))
+    put("box.pie", pie(corners(), polygons()))
     return files
 
 
@@ -231,32 +232,3 @@ def moved_gltf() -> bytes:
             ],
         }
     ).encode()
-
-
-def box_g3d() -> bytes:
-    """The box as two meshes, one with textures, that move away after their first frame."""
-    vertices = surface().vertices.astype("<f4")
-    whole = b"G3D" + struct.pack("<BHB", 4, 2, 0)
-    for name, faces, textures in ((b"bottom", surface().faces[:5], 0b101),
-                                  (b"top", surface().faces[5:], 0)):  # fmt: skip
-        whole += struct.pack("<64s3I8f2I", name, 2, 8, faces.size, *[0.5] * 8, 3, textures)
-        whole += b"texture.png".ljust(64, b"\0") * textures.bit_count()
-        whole += vertices.tobytes() + (vertices + 100).tobytes()
-        whole += np.full((2, 8, 3), 7, "<f4").tobytes()  # normals
-        whole += bytes(8 * 8) if textures else b""
-        whole += faces.astype("<u4").tobytes()
-    return whole
-
-
-def box_pie() -> bytes:
-    """The box as two levels, with hexadecimal flags, places in a texture, and a connector."""
-    sides = polygons()
-    text = "PIE 3\nTYPE 200\nTEXTURE 0 page.png 256 256\nLEVELS 2\n"
-    for level, flags, chosen in ((1, "200", sides[:3]), (2, "aE0", sides[3:])):
-        rows = "".join(f"\t{' '.join(map(str, row))} \n" for row in corners())
-        text += f"LEVEL {level}\nPOINTS 8\n{rows}POLYGONS {len(chosen)}\n"
-        for side in chosen:
-            places = " 0.5 1" * len(side)
-            text += f"\t{flags} {len(side)} {' '.join(map(str, side))}{places}\n"
-        text += "CONNECTORS 1\n\t1 2 3\n"
-    return text.encode()
