@@ -224,14 +224,12 @@ def _check_length(train: TrainSection, phases: tuple[Phase, ...]) -> None:
             f"{train.schedule!r}, wanted one phase (its steps follow from the time) and "
             "'trapezoid' or 'stairs'"
         )
-    if train.minutes:
-        return
-    for phase in phases:
-        if phase.steps % train.steps_at_once:
-            raise ValueError(
-                f"steps_at_once: got {train.steps_at_once}, wanted a divisor of the {phase.steps} "
-                "steps of a phase: a remainder would be compiled separately"
-            )
+    rests = [phase.steps for phase in phases if phase.steps % train.steps_at_once]
+    if rests and not train.minutes:
+        raise ValueError(
+            f"steps_at_once: got {train.steps_at_once}, wanted a divisor of the {rests[0]} steps "
+            "of a phase: a remainder would be compiled separately"
+        )
 
 
 def _made(kind: Any, given: Any, name: str) -> Any:
