@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from cfr_jax.alignment import basins, confidence, doubts, quality, search, solving
+from cfr_jax.alignment import basins, confidence, doubts, measuring, quality, search, solving
 from cfr_jax.alignment.case import Case
+from cfr_jax.geometry import motions
 from cfr_jax.networks.probability import calibration_of
+
+_REACH = 90.0  # degrees: turns by up to 45 about each of three axes stay within
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +73,8 @@ class Alignment:
     starts: int = 1
     """The number of starts that were tried, including those of a second look."""
     alternatives: Float[np.ndarray, "a 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    """Other motions that fit about as well, found by a search. If there are any, the shape is
-    nearly symmetric."""
+    """Other motions that fit about as well or better. They were found by a search or, if the answer
+    would be trusted, by turning it far. If there are any, the shape is nearly symmetric."""
 
     def __eq__(self, other: object) -> bool:
         """Whether all fields but `seconds` are equal, bit by bit."""
@@ -85,7 +89,7 @@ class Alignment:
         the confidence is unknown, or if `alternatives` fit about as well."""
         if self.confidence is None or len(self.alternatives):
             return False
-        return self.determined and self.confidence >= doubts.TRUSTED
+        return self.determined and doubts.trusted(self.confidence)
 
     def to_open3d(self) -> Any:
         """The answer as an `open3d.pipelines.registration.RegistrationResult`.
@@ -117,10 +121,20 @@ def answer(case: Case) -> Alignment:
     rivals = np.zeros((0, 4, 4)) if far is None else search.rivals(far, transform)
     fitness = float(found.quality.fitness)
     clues = confidence.named(found.clues)
-    probability = doubts.probability(
-        calibration_of(case.params), clues, fitness, fitness * len(plan.source.rows), len(rivals)
+    likely = functools.partial(
+        doubts.probability,
+        calibration_of(case.params),
+        clues,
+        fitness,
+        fitness * len(plan.source.rows),
     )
-    free = left_open(case, probability)
+    probability, free = likely(len(rivals)), left_open(case)
+    if free is None and doubts.trusted(probability):
+        around = basins.Surroundings(*_used(case), np.asarray(found.transform, np.float64))
+        free = around.free_turn()
+        if free is None and not len(rivals):
+            rivals = far_rivals(case, around)
+            probability = likely(len(rivals))
     neighbors = min(plan.source.neighbor_count, plan.target.neighbor_count)
     return Alignment(
         transform=transform,
@@ -159,26 +173,40 @@ def answer(case: Case) -> Alignment:
     )
 
 
-def left_open(case: Case, probability: float | None) -> Float[np.ndarray, " 6"] | None:
-    """A twist that the clouds do not determine, or None if there is none.
+def left_open(case: Case) -> Float[np.ndarray, " 6"] | None:
+    """A twist that the clouds do not determine, or None if nudges find none.
 
     If a nudge of the usual size finds a direction free, this direction is tested again with a nudge
-    whose size suits the clouds (`basins.resistance`). If the answer would be trusted, large turns
-    are tried, too (`basins.free_turn`).
+    whose size suits the clouds (`measuring.resistance`).
     """
-    found, plan = case.solved(), case.plan
+    found = case.solved()
     resistance = np.asarray(found.quality.resistance, np.float64)
     twists, transform = (
         np.asarray(value, np.float64) for value in (found.quality.weakest, found.transform)
     )
-    source, target = (
-        unit.points[unit.mask].astype(np.float64) for unit in (plan.source, plan.target)
-    )
     free = resistance < doubts.FREE
     if free.any():
-        resistance[free] = basins.resistance(source, target, transform, twists[free])
-    if resistance.min() < doubts.FREE:
-        return twists[resistance.argmin()]
-    if probability is None or probability < doubts.TRUSTED:
-        return None
-    return basins.free_turn(source, target, transform)
+        resistance[free] = measuring.resistance(*_used(case), transform, twists[free])
+    return twists[resistance.argmin()] if resistance.min() < doubts.FREE else None
+
+
+def far_rivals(case: Case, around: basins.Surroundings) -> Float[np.ndarray, "r 4 4"]:
+    """Motions of the caller's clouds, far from the answer, that fit as well.
+
+    Without a search over all rotations, the answer is taken to lie within the network's reach of
+    where the source was given, and so are they.
+    """
+    frames, searched = case.plan.frames, case.searched
+    first, within = frames, _REACH
+    if searched is not None:
+        first, within = searched.frames, _REACH if searched.nearby else 180.0
+    start = motions.motion(first.initial[:3, :3] @ frames.initial[:3, :3].T)
+    return frames.to_caller(around.rivals(start=start, within=within))
+
+
+def _used(case: Case) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
+    """The points that the network saw, in the unit sphere."""
+    source, target = (
+        unit.points[unit.mask].astype(np.float64) for unit in (case.plan.source, case.plan.target)
+    )
+    return source, target

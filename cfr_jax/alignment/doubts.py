@@ -63,7 +63,7 @@ def warnings_of(
             "not to be trusted: these weights carry no calibration (`cfr calibrate` fits one), so "
             "nothing is known about how likely the answer is right"
         )
-    elif probability < TRUSTED:
+    elif not trusted(probability):
         hint = "" if searched else '; if the clouds are turned far, try initial="global" (--global)'
         warnings.append(
             f"not to be trusted: confidence {probability:.2f}, "
@@ -100,6 +100,11 @@ def probability(
     if fitness < _HARDLY:
         told = min(told, fitness)
     return min(told, 1 / (1 + rivals), 1 - math.exp(-inliers / _INLIERS))
+
+
+def trusted(probability: float | None) -> bool:
+    """Whether an answer is more likely right than wrong. An unknown probability is not enough."""
+    return probability is not None and probability >= TRUSTED
 
 
 def _units_in_words(size_ratio: float) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cfr_jax.alignment import starts
-from cfr_jax.geometry import motions, plausible, units
+from cfr_jax.geometry import motions, plausible, thinning, units
 from cfr_jax.io import PointCloud, as_point_cloud
 from cfr_jax.networks.inputs import Settings, refuse_masked
 
@@ -167,9 +167,9 @@ def _each_place_once(cloud: PointCloud) -> PointCloud:
     """The cloud with each place kept once, if many of its points are repeated. Otherwise the cloud
     itself."""
     rows = np.random.default_rng(0).permutation(len(cloud.points))[:_SAMPLED]
-    if not units.repeated(cloud.points[rows]):
+    if not thinning.repeated(cloud.points[rows]):
         return cloud
-    rows = units.first_of_each_place(cloud.points)
+    rows = thinning.first_of_each_place(cloud.points)
     normals = None if cloud.normals is None else cloud.normals[rows]
     return dataclasses.replace(cloud, points=cloud.points[rows], normals=normals)
 

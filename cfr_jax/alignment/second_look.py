@@ -42,7 +42,7 @@ def look_again(case: Case, *, refine: Refinement | None) -> Case:
     have no calibration, because then nothing says which answer is more likely right.
     """
     first = _confidence(case)
-    if case.plan.start_given or first is None or first >= doubts.TRUSTED:
+    if case.plan.start_given or first is None or doubts.trusted(first):
         return case
     beside = starts.as_they_lie(case.plan.frames)
     case = search.tried(case, starts.around(), beside=beside, nearby=True)
@@ -62,7 +62,7 @@ def look_everywhere(
     """
     plain = finished(case, finish)
     sure = _confidence(plain)
-    if plan.if_doubted and sure is not None and sure >= doubts.TRUSTED:
+    if plan.if_doubted and doubts.trusted(sure):
         return plain
     plain = refining.placed(plain)
     assert plan.starts is not None

@@ -22,7 +22,7 @@ from cfr_jax.data.augmentation.pairs_on_host import View, choose_rows, finish_pa
 from cfr_jax.data.augmentation.sampling import Sampling
 from cfr_jax.data.pairs import Pair
 from cfr_jax.data.perturbations import crop
-from cfr_jax.geometry import units
+from cfr_jax.geometry import thinning, units
 from cfr_jax.io import formats
 from cfr_jax.io.formats import by_suffix
 
@@ -182,7 +182,7 @@ def _view(
     points = (cloud.points - center) / scale
     rows = np.arange(len(points))
     if not uneven:
-        rows = units.subsample(points, sampling.points, int(rng.integers(2**32)))
+        rows = thinning.subsample(points, sampling.points, int(rng.integers(2**32)))
     rows = rows[choose_rows(points[rows], sampling, uneven, rng)]
     normals = None if cloud.normals is None else cloud.normals[rows].astype(np.float32)
     return View(points[rows].astype(np.float32), normals)

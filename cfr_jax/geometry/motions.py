@@ -49,7 +49,7 @@ def inverse(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
 
 
 def angle_between(
-    first: Float[np.ndarray, "*batch 4 4"], second: Float[np.ndarray, "*batch 4 4"]
+    first: Float[np.ndarray, "*#batch 4 4"], second: Float[np.ndarray, "*#batch 4 4"]
 ) -> Float[np.ndarray, "*batch"]:
     """Angle between the rotations of two motions, in degrees, in [0, 180].
 

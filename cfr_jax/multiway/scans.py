@@ -20,7 +20,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from cfr_jax.data.scans import estimate_normals
-from cfr_jax.geometry import units
+from cfr_jax.geometry import thinning, units
 from cfr_jax.io import PointCloud, as_point_cloud
 
 KEPT = 8192  # points that are kept of each scan; the network sees 1,024 of them
@@ -118,7 +118,7 @@ def load(clouds: Sequence[Any], names: Sequence[str], *, seed: int) -> Iterator[
         except (ValueError, OSError) as error:
             yield LeftOut(index, name, str(error).removeprefix(f"{name}: "))
             continue
-        rows = units.subsample(cloud.points, KEPT, seed)
+        rows = thinning.subsample(cloud.points, KEPT, seed)
         normals = None if cloud.normals is None else cloud.normals[rows]
         yield Scan(
             index,

@@ -21,7 +21,8 @@ from jaxtyping import Array, Float
 from cfr_jax.geometry import motions, rigid
 from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.geometry.normals import estimate_normals
-from cfr_jax.geometry.units import bucket, subsample
+from cfr_jax.geometry.thinning import subsample
+from cfr_jax.geometry.units import bucket
 from cfr_jax.refine import generalized_icp
 from cfr_jax.refine.generalized_icp import CUT, Stage
 from cfr_jax.refine.surfaces import Fit, HostSurface, Surface

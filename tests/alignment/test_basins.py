@@ -4,8 +4,9 @@ import hard_cases
 import numpy as np
 import pytest
 import solids
+from scipy.spatial.transform import Rotation
 
-from cfr_jax.alignment import basins, doubts
+from cfr_jax.alignment import basins
 from cfr_jax.geometry import motions
 
 RNG = np.random.default_rng(0)
@@ -26,7 +27,7 @@ def two(draw, count=500):
 def test_a_solid_of_revolution_turns_freely(name):
     source, target = two(hard_cases.REVOLVED[name])
 
-    twist = basins.free_turn(source, target, np.eye(4))
+    twist = basins.Surroundings(source, target, np.eye(4)).free_turn()
 
     assert twist is not None
     if name not in ("sphere", "spheroid"):
@@ -36,15 +37,15 @@ def test_a_solid_of_revolution_turns_freely(name):
 def test_a_shape_without_symmetry_does_not():
     source, target = two(lambda count, rng: solids.lopsided(count, rng.integers(99)).points)
 
-    assert basins.free_turn(source, target, np.eye(4)) is None
+    assert basins.Surroundings(source, target, np.eye(4)).free_turn() is None
 
 
 def test_the_answer_does_not_depend_on_the_frame():
     source, target = two(hard_cases.REVOLVED["torus"])
     turned = solids.motion(70, translation=(0, 0, 0))
 
-    here = basins.free_turn(source, target, np.eye(4))
-    there = basins.free_turn(source, solids.move(turned, target), turned)
+    here = basins.Surroundings(source, target, np.eye(4)).free_turn()
+    there = basins.Surroundings(source, solids.move(turned, target), turned).free_turn()
 
     np.testing.assert_allclose(abs(turned[:3, :3] @ here[:3] @ there[:3]), 1, atol=0.02)
 
@@ -52,27 +53,65 @@ def test_the_answer_does_not_depend_on_the_frame():
 def test_closest_points_bring_a_turned_shape_back():
     points = unit(solids.lopsided(500, 0).points)
     start = motions.motion(motions.from_rotvec(np.radians([0, 0, 12.0])), np.array([0.02, 0, 0]))
-    trees = basins.Tree(points), basins.Tree(points)
 
-    found = basins._settled(*trees, start, 0.05)
+    found = basins.Surroundings(points, points, start)._settled(start[None])[0]
 
     assert solids.degrees_between(found, np.eye(4)) < 1
 
 
-def test_what_lies_near_the_axis_is_nudged_further_until_it_resists(monkeypatch):
-    # given a long, thin bar: under a turn about its length, points move by a tenth of the angle
-    source, target = (RNG.uniform(-1, 1, (800, 3)) * [1.0, 0.12, 0.06] for _ in range(2))
-    about = np.eye(6)[:1]
-
-    (found,) = basins.resistance(source, target, np.eye(4), about)
-    monkeypatch.setattr(basins, "_FARTHEST", 1)  # nudged by the usual size only
-    (usual,) = basins.resistance(source, target, np.eye(4), about)
-
-    assert usual < doubts.FREE < found
+def notched(count, rng):
+    """A cube with an eighth cut out: it fits on itself after thirds of a turn about one diagonal.
+    All but the notch fits after quarter turns, too."""
+    case = hard_cases.notched_cube("notched cube", rng, 1)
+    assert len(case.source) == count
+    return case.source
 
 
-@pytest.mark.parametrize("twist", [[0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 0, 1]])
-def test_a_tube_is_still_free_when_nudged_further(twist):
-    source, target = (solids.cylinder(500, seed).points for seed in (0, 1))
+def about_diagonal(degrees):
+    return motions.motion(motions.from_rotvec(np.radians(degrees) * np.ones(3) / np.sqrt(3)))
 
-    assert basins.resistance(source, target, np.eye(4), np.array([twist], float)) < doubts.FREE
+
+def test_a_notched_cube_has_rivals_a_third_of_a_turn_away():
+    source, target = two(notched)
+
+    found = basins.Surroundings(source, target, np.eye(4)).rivals(start=np.eye(4), within=180.0)
+
+    thirds = [about_diagonal(turn) for turn in (120, 240)]
+    assert len(found) >= 1
+    for motion in found:
+        assert min(solids.degrees_between(motion, third) for third in thirds) < 5
+
+
+def test_a_rival_beyond_the_reach_does_not_count():
+    source, target = two(notched)
+    around = basins.Surroundings(source, target, np.eye(4))
+
+    assert len(around.rivals(start=np.eye(4), within=90.0)) == 0
+    # from a start in between, one of them is within reach
+    (found,) = around.rivals(start=about_diagonal(60), within=90.0)
+    assert solids.degrees_between(found, about_diagonal(120)) < 5
+
+
+def test_a_better_place_is_a_rival_and_comes_first():
+    source, target = two(notched)
+    wrong = motions.motion(motions.from_rotvec(np.radians([0, 0, 90.0])))
+
+    found = basins.Surroundings(source, target, wrong).rivals(start=np.eye(4), within=90.0)
+
+    assert solids.degrees_between(found[0], np.eye(4)) < 5
+
+
+def test_a_shape_without_symmetry_has_no_rivals():
+    source, target = two(lambda count, rng: solids.lopsided(count, rng.integers(99)).points)
+
+    found = basins.Surroundings(source, target, np.eye(4)).rivals(start=np.eye(4), within=180.0)
+
+    assert found.shape == (0, 4, 4)
+
+
+def test_no_rotation_is_far_from_those_that_are_tried():
+    anywhere = Rotation.random(2000, random_state=0).as_matrix()
+    trace = np.einsum("aij,bij->ab", anywhere, basins._ROTATIONS)
+    farthest = np.degrees(np.arccos(np.clip((trace.max(axis=1) - 1) / 2, -1, 1))).max()
+
+    assert farthest < 28

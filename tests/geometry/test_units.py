@@ -5,9 +5,10 @@ import pytest
 import solids
 from scipy.spatial import cKDTree
 
-from cfr_jax.geometry import units
+from cfr_jax.geometry import thinning, units
+from cfr_jax.geometry.thinning import subsample
 from cfr_jax.geometry.trees import Tree
-from cfr_jax.geometry.units import bucket, subsample, to_unit, unit_frames
+from cfr_jax.geometry.units import bucket, to_unit, unit_frames
 from cfr_jax.io import PointCloud
 
 FAR = np.array([5e6, -5e6, 5e6])
@@ -241,4 +242,4 @@ def test_the_first_row_of_each_place_is_numpys():
     points = np.random.default_rng(0).integers(0, 3, (200, 3)).astype(float)
 
     wanted = np.sort(np.unique(points, axis=0, return_index=True)[1])
-    assert units.first_of_each_place(points).tolist() == wanted.tolist()
+    assert thinning.first_of_each_place(points).tolist() == wanted.tolist()
