@@ -5,7 +5,7 @@ import pytest
 import solids
 from scipy.spatial import cKDTree
 
-from cfr_jax.geometry import units
+from cfr_jax.geometry import thinning, units
 from cfr_jax.io import PointCloud
 
 FAR = np.array([300.0, -200.0, 100.0])
@@ -92,7 +92,7 @@ def test_thinning_a_unit_cloud_keeps_some_of_its_points_where_they_are(with_norm
 def test_the_first_point_of_each_voxel_is_found(voxel):
     points = np.random.default_rng(0).normal(size=(500, 3)) * [3, 1, 0.3]
 
-    found = units._first_of_each_voxel(points, voxel)
+    found = thinning._first_of_each_voxel(points, voxel)
 
     first = {}
     for row, point in enumerate(points):
@@ -103,4 +103,4 @@ def test_the_first_point_of_each_voxel_is_found(voxel):
 def test_every_point_of_a_lattice_has_a_voxel_of_its_own():
     points = np.stack(np.meshgrid(*map(np.arange, (4, 5, 6))), -1).reshape(-1, 3).astype(float)
 
-    assert sorted(units._first_of_each_voxel(points, 1.0)) == list(range(120))
+    assert sorted(thinning._first_of_each_voxel(points, 1.0)) == list(range(120))
