@@ -72,13 +72,13 @@ def test_a_far_stray_point_does_not_stretch_the_grid(away):
 
 def test_thinning_looks_at_a_bounded_number_of_points(monkeypatch):
     seen = []
-    search = units._first_of_each_voxel
+    search = thinning._first_of_each_voxel
 
     def counted(points, voxel):
         seen.append(len(points))
         return search(points, voxel)
 
-    monkeypatch.setattr(units, "_first_of_each_voxel", counted)
+    monkeypatch.setattr(thinning, "_first_of_each_voxel", counted)
 
     subsample(np.random.default_rng(0).normal(size=(100_000, 3)), 100, 0)
 
