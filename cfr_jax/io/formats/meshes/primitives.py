@@ -68,7 +68,7 @@ class Primitive:
                 places = [first + odd, first + 1 - odd, first + 2]
             yield self._corners(np.stack(places, axis=1))
 
-    def _corners(self, places: Int64[np.ndarray, ...]) -> Int64[np.ndarray, ...]:
+    def _corners(self, places: Int64[np.ndarray, "*shape"]) -> Int64[np.ndarray, "*shape"]:
         if self.corners is None:
             return places
         corners = self.corners[places].astype(np.int64)
