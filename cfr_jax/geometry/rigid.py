@@ -64,10 +64,7 @@ def fit_rigid(
     weights = weights / (jnp.sum(weights) + 1e-5)
     # The rotation does not depend on the scale of either cloud. Scaling both to about one keeps the
     # covariance within float32's range for clouds of any size, and needs no gradient.
-    size_source, size_target = (
-        lax.stop_gradient(jnp.max(jnp.abs(cloud), initial=jnp.finfo(cloud.dtype).tiny))
-        for cloud in (source, target)
-    )
+    size_source, size_target = (_largest(cloud) for cloud in (source, target))
     small_source, small_target = source / size_source, target / size_target
     center_source = jnp.matmul(weights, small_source, precision=_HIGHEST)
     center_target = jnp.matmul(weights, small_target, precision=_HIGHEST)
@@ -79,6 +76,12 @@ def fit_rigid(
     rotation = nearest_rotation(covariance)
     turned = jnp.matmul(rotation, center_source * size_source, precision=_HIGHEST)
     return from_parts(rotation, center_target * size_target - turned)
+
+
+def _largest(values: Float[Array, "..."]) -> Float[Array, ""]:
+    """The largest absolute value, or one if all are zero; a constant to derivatives."""
+    largest = jnp.max(jnp.abs(values), initial=0)
+    return lax.stop_gradient(jnp.where(largest > 0, largest, 1))
 
 
 @jax.custom_jvp
