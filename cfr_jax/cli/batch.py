@@ -87,7 +87,7 @@ def _kinds() -> str:
     """The kinds of data that have pairs, or clouds to pair, one line each."""
     return "\n".join(
         f"  {kind.name:11s} {kind.words}"
-        for kind in kinds.known()
+        for kind in kinds.entries()
         if kind.list_pairs is not None or kind.list_scans is not None
     )
 

@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
     params, notes = _weights(args.checkpoint)
     save_params(args.out, params, notes, float16=args.float16)
-    record = table.network(network_of(params))
+    record = table.named(network_of(params))
     trained = f", {record.iterations(params)} iterations" if record.iterations else ""
     print(f"wrote       {args.out}: {record.title}{trained}")
     print(f"sha256      {read_weights(args.out).sha256}")

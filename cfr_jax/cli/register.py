@@ -95,7 +95,7 @@ def add_parser(commands: Commands) -> None:
         metavar="WAY",
         default=True,
         help="what refines it: "
-        + "; ".join(f"{name}, {refine.refinement(name).title}" for name in refine.names())
+        + "; ".join(f"{name}, {refine.named(name).title}" for name in refine.names())
         + f"; or module:function (default: {refine.DEFAULT})",
     )
     flags.add(how, "--weights")

@@ -60,7 +60,7 @@ def read(
     if samples is not None and samples < 0:
         raise ValueError(f"samples must be 0 or more, got {samples}")
     named = checked_columns(columns)
-    shape = read_shape(path, formats.known(), columns=named, whole=properties)
+    shape = read_shape(path, formats.entries(), columns=named, whole=properties)
     if properties and isinstance(shape, Mesh) and shape.table is None:
         shape = replace(shape, table=table_of_mesh(shape))
     try:

@@ -111,7 +111,7 @@ def add(refinement: Refinement) -> None:
     _TABLE[refinement.name] = refinement
 
 
-def refinement(name: str) -> Refinement:
+def named(name: str) -> Refinement:
     """The refinement with this name.
 
     "module:function" names any importable function, which then runs on the host. This is how
@@ -132,8 +132,8 @@ def find(refine: bool | str) -> Refinement | None:
     """The refinement that an option asks for: the named one, the default for True, or None for
     False."""
     if isinstance(refine, bool):
-        return refinement(DEFAULT) if refine else None
-    return refinement(refine)
+        return named(DEFAULT) if refine else None
+    return named(refine)
 
 
 def _elsewhere(place: str) -> Refinement:

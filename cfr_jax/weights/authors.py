@@ -124,7 +124,7 @@ def _some(faults: list[str]) -> str:
 def _recognized(names: Collection[str], where: str) -> tuple[Network, Checkpoint]:
     """The network whose authors' checkpoints have tensors with these names."""
     titles = []
-    for record in map(table.network, table.names()):
+    for record in map(table.named, table.names()):
         if record.checkpoint is None:
             continue
         if record.checkpoint.recognizes(names):

@@ -155,7 +155,7 @@ def read_weights(source: str | Path = DEFAULT, network: str | None = None) -> We
     except ValueError as error:
         raise Refused(f"{where}: {error}") from error
     if network not in (None, record.name):
-        wanted = table.network(network).title
+        wanted = table.named(network).title
         raise Refused(f"{where} holds the network {record.title}, wanted {wanted}")
     wide = {
         name: value.astype(np.float32) if value.dtype == np.float16 else value

@@ -447,7 +447,7 @@ def test_a_batch_answers_as_each_pair_alone(tmp_path, params, cascades):
     save_params(tmp_path / "w.safetensors", params)
     pairs = [a_pair(seed, points=70) for seed in range(3)]
     solve = make_network(
-        network=table.network("cfr"),
+        network=table.named("cfr"),
         weights=str(tmp_path / "w.safetensors"),
         refine=False,
         batch=2,
@@ -485,7 +485,7 @@ def test_clouds_of_any_size_go_through_align(monkeypatch):
 
     # when
     solve = network_solver.make_network(
-        network=table.network("cfr"),
+        network=table.named("cfr"),
         weights="w",
         refine=True,
         through="align",
@@ -508,11 +508,11 @@ def test_a_network_goes_through_register_or_align_and_nothing_else(unchecked):
 
     with pytest.raises(ValueError, match="through is 'luck'"):
         network_solver.make_network(
-            network=table.network("cfr"), weights="w", refine=True, through="luck"
+            network=table.named("cfr"), weights="w", refine=True, through="luck"
         )
     with pytest.raises(ValueError, match="cascades is 0"):
         network_solver.make_network(
-            network=table.network("cfr"), weights="w", refine=True, cascades=0
+            network=table.named("cfr"), weights="w", refine=True, cascades=0
         )
 
 
@@ -528,7 +528,7 @@ def a_network(tmp_path, network: str, **options):
     params = from_state_dict(made(0))
     save_params(tmp_path / "w.safetensors", params)
     solve = make_network(
-        network=table.network(network),
+        network=table.named(network),
         weights=str(tmp_path / "w.safetensors"),
         refine=False,
         **options,
@@ -633,7 +633,7 @@ def test_the_modules_that_are_timed_are_those_of_a_registration(tmp_path, networ
         (motion,) = motions(rpmnet.unroll, params, source, target, small)
 
     # when the last part is run
-    *_, last = table.network(network).parts(params, small)(source, target)
+    *_, last = table.named(network).parts(params, small)(source, target)
 
     # then it leaves the source where a registration does
     assert last.module == parts.MOTION
@@ -665,7 +665,7 @@ def test_each_module_is_counted_as_often_as_a_registration_runs_it(
 
     # given how often each module of a registration is to be timed
     _, params = a_network(tmp_path, network)
-    record = table.network(network)
+    record = table.named(network)
     chosen = record.settings(neighbors=8, **settings)
     clouds = module_times._clouds(a_pair(), estimated=True)
     counted = Counter()
