@@ -158,7 +158,7 @@ def _tell(records: Iterable[dict[str, Any]], out: Path, kept: Path, strict: bool
     """Writes the table, and says what became of the pairs; each record is in memory by itself."""
     from cfr_jax.batch.records import write_table
     from cfr_jax.runtime.atomic import unfinished
-    from cfr_jax.runtime.words import shown
+    from cfr_jax.runtime.messages import shown
 
     count = failed = trusted = 0
     reasons: list[tuple[str, str]] = []

@@ -77,7 +77,7 @@ def _weights(checkpoint: Path) -> tuple[Params, dict[str, str]]:
 
     from cfr_jax import __version__
     from cfr_jax.runtime.reading import contents
-    from cfr_jax.weights.authors import convert
+    from cfr_jax.weights.conversion import convert
     from cfr_jax.weights.files import is_ours, read_weights
 
     if is_ours(checkpoint):

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from cfr_jax.data import kinds
 from cfr_jax.data.kinds.kind import DataKind
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import irregular
-from cfr_jax.runtime.words import Refused, shown
 
 
 @dataclass(frozen=True)

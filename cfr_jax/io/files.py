@@ -19,7 +19,7 @@ from cfr_jax.io.naming import checked_columns
 from cfr_jax.io.table import table_of_mesh
 from cfr_jax.runtime import reading
 from cfr_jax.runtime.atomic import unfinished
-from cfr_jax.runtime.words import Refused, shown
+from cfr_jax.runtime.messages import Refused, shown
 
 
 def read(

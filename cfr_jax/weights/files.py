@@ -22,8 +22,8 @@ from cfr_jax.networks.clues import NetworkClues
 from cfr_jax.networks.probability import KEY, Calibration, calibration_of, uncalibrated
 from cfr_jax.networks.record import Network, Params
 from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import contents, parse_json
-from cfr_jax.runtime.words import Refused, shown
 
 SHIPPED = Path(__file__).parent / "shipped"
 DEFAULT = "object"

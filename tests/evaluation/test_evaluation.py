@@ -521,7 +521,7 @@ def a_network(tmp_path, network: str, **options):
     from oracle import authors
 
     from cfr_jax.evaluation.solvers.network_solver import make_network
-    from cfr_jax.weights.authors import from_state_dict
+    from cfr_jax.weights.conversion import from_state_dict
     from cfr_jax.weights.files import save_params
 
     made = {"cfr": authors.random_state_dict, "rpmnet": authors.random_rpmnet_state_dict}[network]
@@ -615,7 +615,7 @@ def test_the_modules_that_are_timed_are_those_of_a_registration(tmp_path, networ
 
     from cfr_jax.evaluation.solvers import module_times
     from cfr_jax.geometry import rigid
-    from cfr_jax.networks import inputs, parts, rpmnet
+    from cfr_jax.networks import inputs, rpmnet, timed_parts
     from cfr_jax.networks.cfr import iterations
 
     # given the parts of a registration of one iteration
@@ -636,7 +636,7 @@ def test_the_modules_that_are_timed_are_those_of_a_registration(tmp_path, networ
     *_, last = table.named(network).parts(params, small)(source, target)
 
     # then it leaves the source where a registration does
-    assert last.module == parts.MOTION
+    assert last.module == timed_parts.MOTION
     wanted = rigid.apply(jnp.asarray(motion), source.points)
     np.testing.assert_allclose(last.function(*last.arguments), wanted, atol=1e-5)
 
@@ -660,7 +660,7 @@ def test_each_module_is_counted_as_often_as_a_registration_runs_it(
 
     from cfr_jax.evaluation.solvers import module_times
     from cfr_jax.geometry import rigid
-    from cfr_jax.networks import parts, rpmnet
+    from cfr_jax.networks import rpmnet, timed_parts
     from cfr_jax.networks.cfr import iterations
 
     # given how often each module of a registration is to be timed
@@ -701,11 +701,11 @@ def test_each_module_is_counted_as_often_as_a_registration_runs_it(
     else:
         searches, features = ran["search"], ran["Features", "__call__"]
     assert counted == {
-        parts.NEIGHBORS: searches,
-        parts.FEATURES: features,
-        parts.ANNEALING: ran["AnnealingNet", "__call__"],
-        parts.MATCHING: ran["match"],
-        parts.MOTION: ran["fit"],
+        timed_parts.NEIGHBORS: searches,
+        timed_parts.FEATURES: features,
+        timed_parts.ANNEALING: ran["AnnealingNet", "__call__"],
+        timed_parts.MATCHING: ran["match"],
+        timed_parts.MOTION: ran["fit"],
     }
     assert ran["match"] == 5
 

@@ -15,7 +15,7 @@ from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.networks import table
 from cfr_jax.networks.inputs import Cloud
 from cfr_jax.networks.peers import fmr, rgm
-from cfr_jax.weights.authors import from_state_dict
+from cfr_jax.weights.conversion import from_state_dict
 
 N, M, WIDTH = 60, 55, 32
 STATES = {

@@ -12,7 +12,7 @@ from safetensors.numpy import save_file
 
 from cfr_jax.cli import main
 from cfr_jax.networks import table
-from cfr_jax.weights.authors import convert, from_state_dict
+from cfr_jax.weights.conversion import convert, from_state_dict
 from cfr_jax.weights.files import network_of, read_weights
 
 # What random state dict, of how many tensors; which network, and how it is made anew.
