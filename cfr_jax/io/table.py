@@ -28,7 +28,7 @@ class Table:
         values: arrays (n,) or (n, k), of the file's own types.
         roles: which columns are points and normals.
         polygons: the faces between the rows, if the file has any.
-        rest: what only the format `format` can write again: other elements, headers, arrays.
+        rest: what only this format can write again: other elements, headers, arrays.
         format: the name of the format that this comes from.
     """
 
