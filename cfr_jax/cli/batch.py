@@ -49,7 +49,7 @@ def add_parser(commands: Commands) -> None:
     """Adds `cfr batch`."""
     parser = commands.add_parser(
         "batch",
-        help="register many pairs, from a list or a folder, into one table",
+        help="register many pairs of a list or a folder into one table",
         description=_DESCRIPTION.format(kinds=_kinds()),
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -58,12 +58,16 @@ def add_parser(commands: Commands) -> None:
     parser.set_defaults(run=run)
     parser.add_argument("pairs", metavar="PAIRS", type=Path, help="a list, a file or a folder")
     parser.add_argument(
-        "--out", metavar="FILE.csv", type=Path, required=True, help="where the table goes"
+        "--out",
+        metavar="FILE.csv",
+        type=Path,
+        required=True,
+        help="the table (required)",
     )
     parser.add_argument(
         "--layout",
         metavar="KIND",
-        help="which of these PAIRS is, if it is not recognized correctly",
+        help="which of these PAIRS is (default: recognized)",
     )
     parser.add_argument(
         "--target", metavar="FILE", type=Path, help="the target of every cloud in a folder"

@@ -47,7 +47,7 @@ def add_parser(commands: Commands) -> None:
         metavar="FILE.safetensors",
         type=Path,
         required=True,
-        help="where to write the weights",
+        help="where to write the weights (required)",
     )
     parser.add_argument(
         "--float16", action="store_true", help="store large tensors in float16: half the size"
