@@ -63,8 +63,8 @@ def merge(
     the spacing of the scans' points), unless `fused` is False.
 
     `kept` stores the registrations and is looked up first, so a run that was killed continues where
-    it stopped if `kept` is a file, such as a `batch.journal.Journal`. `max_points`, `seed`, `batch` and `workers` are those of
-    `align_many`. The same call gives the same answer.
+    it stopped if `kept` is a file, such as a `batch.journal.Journal`. `max_points`, `seed`, `batch`
+    and `workers` are those of `align_many`. The same call gives the same answer.
 
     Raises ValueError for options that cannot be used, and if fewer than two scans can be merged.
     """
