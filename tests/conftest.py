@@ -86,7 +86,7 @@ def state_dict():
 @pytest.fixture(scope="session")
 def params(state_dict):
     """The same weights as ours."""
-    from cfr_jax.weights.authors import from_state_dict
+    from cfr_jax.weights.conversion import from_state_dict
 
     return from_state_dict(state_dict)
 

@@ -1,4 +1,4 @@
-"""Makes the pair of scans that ships with the package: two views of a fork lift.
+"""Makes the pair of scans that ships with the package: two views of a forklift.
 
     python tools/make_demo_pair.py PACKAGE_OR_LIBRARY [--out cfr_jax/cli/demo_pair]
 

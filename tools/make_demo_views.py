@@ -1,4 +1,4 @@
-"""Makes the views that `cfr demo --merge` merges: depth cameras all around a fork lift.
+"""Makes the views that `cfr demo --merge` merges: depth cameras all around a forklift.
 
     python -m tools.make_demo_views PACKAGE_OR_LIBRARY [--out cfr_jax/cli/demo_views]
 

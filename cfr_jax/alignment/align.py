@@ -5,15 +5,12 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, Literal
-
-import numpy as np
-from jaxtyping import Float
+from typing import Any
 
 from cfr_jax.alignment import confidence
 from cfr_jax.alignment.answers import Alignment, answer
 from cfr_jax.alignment.case import Case
-from cfr_jax.alignment.planning import Plan, planned
+from cfr_jax.alignment.planning import Initial, Plan, planned
 from cfr_jax.alignment.refining import refine_every_point, refine_used_points
 from cfr_jax.alignment.search import search
 from cfr_jax.alignment.second_look import keep_start, look_again, look_everywhere
@@ -21,7 +18,7 @@ from cfr_jax.alignment.solving import on_accelerator, solve_case
 from cfr_jax.networks.cfr.network import check_params
 from cfr_jax.networks.probability import calibration_of
 from cfr_jax.networks.record import Params
-from cfr_jax.refine import Refinement, find
+from cfr_jax.refine import Refine, Refinement, find
 from cfr_jax.weights.files import load_params
 
 
@@ -30,57 +27,56 @@ def align(
     target: Any,
     *,
     params: Params | None = None,
-    refine: bool | str = True,
-    initial: Float[np.ndarray, "4 4"]
-    | Float[np.ndarray, "k 4 4"]
-    | Literal["global", "auto"]
-    | None = None,
+    refine: Refine = True,
+    initial: Initial = None,
     max_points: int | None = None,
     all_points: bool = True,
     second_look: bool = True,
     seed: int = 0,
 ) -> Alignment:
-    """Finds the rigid motion that lays `source` on `target`.
+    """Finds the rigid motion that moves `source` onto `target`.
 
-    A cloud is an (n, 3) array, an (n, 6) array with normals, a path, or anything else that
-    `io.as_point_cloud` accepts. Both clouds are centered and scaled in float64, and thinned to
-    `max_points` each (default 1,024; `seed` determines which points are kept). Normals are
-    estimated if a cloud has none. The network with `params` (default: the shipped weights) then
-    registers the clouds in two cascades.
+    The clouds may have any size and offset, and any unit that is the same for both. They are
+    centered and scaled in float64, and thinned. The network registers them in two cascades, and a
+    local refinement makes its answer precise. The same call gives the same answer, bit by bit, on
+    the same machine. There is no gradient; `register` has one.
 
-    `refine` says how this answer is refined: with our own generalized ICP (True), with another
-    refinement from the table of `cfr_jax.refine` (such as "small_gicp"), or not at all (False). If
-    a cloud was thinned, a last refinement uses all points of both clouds (`refine.all_points`), and
-    `fitness`, `inlier_rmse`, `overlap` and `information` are measured on all points. With
-    `all_points=False`, everything is computed on the thinned clouds. A refinement never makes the
-    score worse.
+    Args:
+        source: The cloud that moves: an (n, 3) array, an (n, 6) array with normals, a path, or
+            anything else that `io.as_point_cloud` accepts. Missing normals are estimated.
+        target: The cloud that stays, likewise.
+        params: The network's weights, as `load_params` returns them (default: the shipped ones).
+        refine: How the network's answer is refined: True for the generalized ICP of this package,
+            False for not at all, or another name in the table of `cfr_jax.refine`, such as
+            "small_gicp", or "module:function". A refinement that makes the fit worse is dropped.
+        initial: Where to start. The network is trained for rotations of up to 45 degrees about each
+            axis from the start.
+            None: the centroids are moved onto each other.
+            A (4, 4) array: a rough guess of the answer. It is also refined without the network, and
+            that answer is kept if the clouds fit better with it.
+            A (k, 4, 4) array: several guesses. The best of them on thinned clouds is the start.
+            "global": starts that cover all rotations are tried, too. This takes several times as
+            long. The motion found is taken if it is clearly better than the answer without these
+            starts. Other motions that fit about as well are reported in `alternatives`.
+            "auto": the same, but only if the confidence in the first answer is below one half.
+        max_points: How many points of each cloud the network sees at most (default: 1,024).
+        all_points: Whether a last refinement uses all points of clouds that were thinned. Then
+            `fitness`, `inlier_rmse`, `overlap` and `information` are measured on all points, too.
+        second_look: Whether an answer that is not trusted is compared with answers from other
+            starts: the identity, and rotations around the first start. The one that is more likely
+            right is kept. Without effect if `initial` is given, or if the weights have no
+            calibration, which tells the better answer.
+        seed: Which points are kept when a cloud is thinned.
 
-    `initial` says where to start. Without it, the centroids are laid on each other. The network is
-    trained for rotations of up to 45 degrees about each axis from the start.
+    Returns:
+        An `Alignment`. Read `transform` (4, 4), `trusted` and `warnings` first. The transform maps
+        source onto target, in the unit and the frames of the clouds: `T @ [x; 1]`.
 
-    - A (4, 4) motion moves the source close to the target first. This start is also refined without
-      the network. That answer is kept if the clouds then fit better than after the network, as
-      measured on all points in both directions (`measuring.misfit`).
-    - Several motions (k, 4, 4) are all tried on thinned clouds. The one from which the clouds fit
-      best is used as the start.
-    - "global" also tries starts that cover all rotations (`search`), and takes the motion that it
-      finds if this is clearly better than the answer without them. This takes several times as
-      long, and also reports other motions that fit about as well.
-    - "auto" does the same as "global", but only if the confidence in the answer without these
-      starts is below one half.
-
-    If there is no `initial` and the refined answer is not trusted, it gets a `second_look`: the
-    clouds as they lie, and some starts around the first one, are tried in the same way. Whichever
-    answer is more likely right is kept. Weights without a calibration cannot tell which one that
-    is, so they get no second look.
-
-    Of the `Alignment` that it returns, read `transform`, `trusted` and `warnings` first. The same
-    call gives the same answer, bit by bit, on the same machine.
-
-    Raises ValueError for clouds without extent or with fewer than 3 points, for wrong shapes, for
-    values that are not finite, and for an `initial` that is not a rigid motion or that leaves the
-    clouds far apart. Raises `io.CloudFileError` for bad files, and ModuleNotFoundError if the
-    library of `refine` is missing.
+    Raises:
+        ValueError: A cloud has no extent or fewer than 3 points. A shape is wrong. A value is not
+            finite. `initial` is not a rigid motion, or leaves the clouds far apart.
+        CloudFileError: A file cannot be read.
+        ModuleNotFoundError: The library that `refine` needs is missing.
     """
     began = time.perf_counter()
     refinements = chosen_refinements(refine, all_points=all_points)
@@ -100,7 +96,7 @@ def align(
     return answer(case)
 
 
-def chosen_refinements(refine: bool | str, *, all_points: bool = True) -> tuple[Refinement, ...]:
+def chosen_refinements(refine: Refine, *, all_points: bool = True) -> tuple[Refinement, ...]:
     """The refinements that `align` runs, in order. Raises ModuleNotFoundError if a library that
     one of them needs is missing."""
     first = find(refine)

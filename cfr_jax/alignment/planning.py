@@ -21,7 +21,7 @@ SETTINGS = Settings()
 _SAMPLED = 2048  # points that are looked at to find out whether many are repeated
 CASCADES = 2  # chosen on validation pairs (docs/training.md)
 
-
+# What the option `initial` of `align` takes.
 Initial = Float[np.ndarray, "4 4"] | Float[np.ndarray, "k 4 4"] | Literal["global", "auto"] | None
 
 

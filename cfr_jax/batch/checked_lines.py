@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import opened, parse_json
-from cfr_jax.runtime.words import Refused, shown
 
 _CHECK = 16  # hexadecimal digits
 _END = re.compile(rb', "check": "([0-9a-f]{%d})"}\n' % _CHECK)

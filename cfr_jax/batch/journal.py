@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from cfr_jax.batch.checked_lines import line_of, record_at, records_in
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import irregular, opened
-from cfr_jax.runtime.words import Refused, shown
 
 Key = tuple[str, str, int]
 

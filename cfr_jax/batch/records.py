@@ -8,7 +8,7 @@ from typing import Any, TextIO
 
 from cfr_jax.batch.jobs import Job
 from cfr_jax.batch.stream import Outcome
-from cfr_jax.runtime.words import escaped
+from cfr_jax.runtime.messages import escaped
 
 _FIGURES = ("trusted", "confidence", "determined", "fitness", "inlier_rmse", "inlier_distance")
 _CELLS = tuple(f"t{row}{column}" for row in range(4) for column in range(4))

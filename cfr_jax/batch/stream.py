@@ -18,6 +18,7 @@ from cfr_jax.batch.memo import Memo
 from cfr_jax.geometry import units
 from cfr_jax.io import PointCloud, as_point_cloud
 from cfr_jax.networks.record import Params
+from cfr_jax.refine import Refine
 
 # More pairs per call keep an accelerator busy, but do not fit in a CPU's caches.
 ON_CPU, ON_ACCELERATOR = 1, 16
@@ -41,7 +42,7 @@ def align_many(
     pairs: Iterable[Any],
     *,
     params: Params | None = None,
-    refine: bool | str = True,
+    refine: Refine = True,
     max_points: int | None = None,
     all_points: bool = True,
     second_look: bool = True,

@@ -26,7 +26,7 @@ from cfr_jax.cli import (
     reproduce,
     view,
 )
-from cfr_jax.runtime.words import tidy
+from cfr_jax.runtime.messages import tidy
 
 _COMMANDS = (
     register,

@@ -49,7 +49,7 @@ def add_parser(commands: Commands) -> None:
     """Adds `cfr batch`."""
     parser = commands.add_parser(
         "batch",
-        help="register many pairs, from a list or a folder, into one table",
+        help="register many pairs of a list or a folder into one table",
         description=_DESCRIPTION.format(kinds=_kinds()),
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -58,12 +58,16 @@ def add_parser(commands: Commands) -> None:
     parser.set_defaults(run=run)
     parser.add_argument("pairs", metavar="PAIRS", type=Path, help="a list, a file or a folder")
     parser.add_argument(
-        "--out", metavar="FILE.csv", type=Path, required=True, help="where the table goes"
+        "--out",
+        metavar="FILE.csv",
+        type=Path,
+        required=True,
+        help="the table (required)",
     )
     parser.add_argument(
         "--layout",
         metavar="KIND",
-        help="which of these PAIRS is, if it is not recognized correctly",
+        help="which of these PAIRS is (default: recognized)",
     )
     parser.add_argument(
         "--target", metavar="FILE", type=Path, help="the target of every cloud in a folder"
@@ -87,7 +91,7 @@ def _kinds() -> str:
     """The kinds of data that have pairs, or clouds to pair, one line each."""
     return "\n".join(
         f"  {kind.name:11s} {kind.words}"
-        for kind in kinds.known()
+        for kind in kinds.entries()
         if kind.list_pairs is not None or kind.list_scans is not None
     )
 
@@ -158,7 +162,7 @@ def _tell(records: Iterable[dict[str, Any]], out: Path, kept: Path, strict: bool
     """Writes the table, and says what became of the pairs; each record is in memory by itself."""
     from cfr_jax.batch.records import write_table
     from cfr_jax.runtime.atomic import unfinished
-    from cfr_jax.runtime.words import shown
+    from cfr_jax.runtime.messages import shown
 
     count = failed = trusted = 0
     reasons: list[tuple[str, str]] = []

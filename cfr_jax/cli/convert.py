@@ -47,7 +47,7 @@ def add_parser(commands: Commands) -> None:
         metavar="FILE.safetensors",
         type=Path,
         required=True,
-        help="where to write the weights",
+        help="where to write the weights (required)",
     )
     parser.add_argument(
         "--float16", action="store_true", help="store large tensors in float16: half the size"
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
     params, notes = _weights(args.checkpoint)
     save_params(args.out, params, notes, float16=args.float16)
-    record = table.network(network_of(params))
+    record = table.named(network_of(params))
     trained = f", {record.iterations(params)} iterations" if record.iterations else ""
     print(f"wrote       {args.out}: {record.title}{trained}")
     print(f"sha256      {read_weights(args.out).sha256}")
@@ -77,7 +77,7 @@ def _weights(checkpoint: Path) -> tuple[Params, dict[str, str]]:
 
     from cfr_jax import __version__
     from cfr_jax.runtime.reading import contents
-    from cfr_jax.weights.authors import convert
+    from cfr_jax.weights.conversion import convert
     from cfr_jax.weights.files import is_ours, read_weights
 
     if is_ours(checkpoint):

@@ -70,6 +70,12 @@ def add_parser(subparsers: Commands) -> None:
         title="commands", dest="data_command", metavar="COMMAND", required=True
     )
 
+    _add_build(commands, style)
+    _add_open_cad(commands, style)
+    _add_info(commands, style)
+
+
+def _add_build(commands: Commands, style: dict[str, Any]) -> None:
     build = commands.add_parser(
         "build",
         help="build a corpus from a folder of meshes",
@@ -77,26 +83,23 @@ def add_parser(subparsers: Commands) -> None:
         **style,
     )
     build.set_defaults(run=_build)
+    build.add_argument("folder", metavar="FOLDER", type=Path, help="meshes, a folder per category")
     build.add_argument(
-        "folder", metavar="FOLDER", type=Path, help="meshes, one folder per category"
-    )
-    build.add_argument(
-        "--out", metavar="DIR|FILE.h5", type=Path, required=True, help="where the corpus goes"
+        "--out", metavar="DIR|FILE.h5", type=Path, required=True, help="the corpus (required)"
     )
     build.add_argument(
         "--unseen", metavar="A,B,...", help="categories for test.h5, or 'none', or 'all'"
     )
     build.add_argument(
-        "--points", metavar="N", type=int, default=2048, help="points per shape (2048)"
+        "--points", metavar="N", type=int, default=2048, help="points per shape (default: 2048)"
     )
     build.add_argument(
         "--least-faces",
         metavar="N",
         type=int,
         default=20,
-        help="leave out meshes with fewer faces (20)",
+        help="leave out meshes with fewer faces (default: 20)",
     )
-
     build.add_argument(
         "--files",
         metavar="PATTERN",
@@ -110,6 +113,8 @@ def add_parser(subparsers: Commands) -> None:
         help="categories from a classification of the Princeton Shape Benchmark's form",
     )
 
+
+def _add_open_cad(commands: Commands, style: dict[str, Any]) -> None:
     open_cad = commands.add_parser(
         "open-cad",
         help="build the open corpus from Debian's packages",
@@ -118,21 +123,18 @@ def add_parser(subparsers: Commands) -> None:
     )
     open_cad.set_defaults(run=_open_cad)
     open_cad.add_argument(
-        "--out", metavar="DIR", type=Path, required=True, help="where the corpus goes"
+        "--out", metavar="DIR", type=Path, required=True, help="the corpus (required)"
     )
     open_cad.add_argument(
         "--debs", metavar="DIR", type=Path, help="folder of the .deb files (default: ask apt)"
     )
     open_cad.add_argument(
-        "--compare",
-        metavar="DIR",
-        type=Path,
-        help="another build of this corpus: report the differences",
+        "--compare", metavar="DIR", type=Path, help="another build: report the differences"
     )
 
-    info = commands.add_parser(
-        "info", help="show what a corpus holds", description=_INFO, **style
-    )  # fmt: skip
+
+def _add_info(commands: Commands, style: dict[str, Any]) -> None:
+    info = commands.add_parser("info", help="show what a corpus holds", description=_INFO, **style)
     info.set_defaults(run=_info)
     info.add_argument(
         "file", metavar="FILE", type=Path, help="any data: a corpus, pairs, scans, clouds, meshes"

@@ -101,7 +101,7 @@ def _merge(folder: Path) -> int:
     files = sorted(_VIEWS.glob("*.ply"))
     names = [path.name for path in files]
     truth = read_poses(_VIEWS / "poses.json", names)
-    print("Eight views all around a fork lift, each turned its own way.\n")
+    print("Eight views all around a forklift, each turned its own way.\n")
     merged = merge(files, progress=True)
     print(as_text(merged))
     if merged.clouds:
@@ -115,7 +115,7 @@ def _merge(folder: Path) -> int:
         ]
         print(f"error       {max(angles):.2f}° at most, against the known poses")
         io.write(cloud, merged.clouds[0].as_cloud())
-        viewer.write_layers(page, as_layers(merged), title="fork lift")
+        viewer.write_layers(page, as_layers(merged), title="forklift")
         print(f"\nwrote       {cloud}\nwrote       {page} (open it in a browser and rotate it)")
     return 0
 

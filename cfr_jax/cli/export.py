@@ -35,7 +35,11 @@ def add_parser(commands: Commands) -> None:
     )
     parser.set_defaults(run=run)
     parser.add_argument(
-        "--out", metavar="FILE.stablehlo", type=Path, required=True, help="where to write it"
+        "--out",
+        metavar="FILE.stablehlo",
+        type=Path,
+        required=True,
+        help="the program (required)",
     )
     parser.add_argument(
         "--points",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,7 +50,7 @@ def add_parser(commands: Commands) -> None:
     """Adds `cfr merge`."""
     parser = commands.add_parser(
         "merge",
-        help="merge many scans of one thing into one model, with the pose of each",
+        help="merge many scans of one thing into one model",
         description=_DESCRIPTION,
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -62,7 +63,7 @@ def add_parser(commands: Commands) -> None:
         metavar="FILE",
         type=Path,
         required=True,
-        help=f"the merged cloud ({' '.join(outputs.cloud_suffixes())})",
+        help=f"the merged cloud, required ({' '.join(outputs.cloud_suffixes())})",
     )
     parser.add_argument("--poses", metavar="FILE", type=Path, help="the poses (formats: below)")
     parser.add_argument(
@@ -75,6 +76,12 @@ def add_parser(commands: Commands) -> None:
         help="one point for each cube of this size (default: the spacing of the scans' points)",
     )
     flags.add_strict(parser, "a scan was left out, or there are several models")
+    _add_pairs(parser)
+    how = parser.add_argument_group("how to register")
+    flags.add(how, "--weights", "--max-points", "--seed", "--workers")
+
+
+def _add_pairs(parser: argparse.ArgumentParser) -> None:
     which = parser.add_argument_group("which pairs to register")
     which.add_argument(
         "--sequence", action="store_true", help="each scan with the next two, not with all"
@@ -94,36 +101,20 @@ def add_parser(commands: Commands) -> None:
         "--initial", metavar="FILE", type=Path, help="poses to start from (formats: below)"
     )
     flags.add(which, "--shard", "--retry-failed")
-    how = parser.add_argument_group("how to register")
-    flags.add(how, "--weights", "--max-points", "--seed", "--workers")
 
 
 def run(args: argparse.Namespace) -> int:
     """Checks the arguments, merges, and writes; what is registered is kept on the way."""
     files = _files(args.scans)
-    written = [path for path in (args.out, args.poses, args.view) if path is not None]
-    outputs.check_output("--out", args.out, outputs.cloud_suffixes())
-    if args.poses is not None:
-        from cfr_jax.multiway.pose_files import SUFFIXES
-
-        outputs.check_output("--poses", args.poses, SUFFIXES)
-    if args.view is not None:
-        outputs.check_output("--view", args.view, outputs.PAGE_SUFFIXES)
-    outputs.check_apart([*files, *filter(None, [args.initial])], written)
+    written = _checked_outputs(args, files)
 
     from cfr_jax.cli.shared.cache import keep_compiled_programs
     from cfr_jax.multiway import merging
-    from cfr_jax.multiway.pose_files import read_poses
     from cfr_jax.multiway.scans import names_of
 
     keep_compiled_programs()
     weights = flags.weights_of(args.weights)
-    names = names_of(files)
-    guesses = None
-    if args.initial is not None:
-        held = read_poses(args.initial, names)
-        guesses = [held.get(name) for name in names]
-        print(f"initial     poses of {len(held)} of {len(names)} scans")
+    guesses = None if args.initial is None else _guesses(args.initial, names_of(files))
     made_with = {
         "weights": weights.sha256,
         "max_points": args.max_points,
@@ -165,6 +156,20 @@ def run(args: argparse.Namespace) -> int:
     return _tell(found, args, kept)
 
 
+def _checked_outputs(args: argparse.Namespace, files: list[Path]) -> list[Path]:
+    """The files that the options name, which can all be written."""
+    outputs.check_output("--out", args.out, outputs.cloud_suffixes())
+    if args.poses is not None:
+        from cfr_jax.multiway.pose_files import SUFFIXES
+
+        outputs.check_output("--poses", args.poses, SUFFIXES)
+    if args.view is not None:
+        outputs.check_output("--view", args.view, outputs.PAGE_SUFFIXES)
+    written = [path for path in (args.out, args.poses, args.view) if path is not None]
+    outputs.check_apart([*files, *filter(None, [args.initial])], written)
+    return written
+
+
 def _files(given: list[Path]) -> list[Path]:
     """The scans, folders opened, each file once."""
     from cfr_jax.data.folders import loose_files
@@ -178,6 +183,15 @@ def _files(given: list[Path]) -> list[Path]:
     if len(files) < 2:
         raise ValueError(f"SCANS: found {len(files)} scans, wanted at least two")
     return files
+
+
+def _guesses(path: Path, names: Sequence[str]) -> list[Any]:
+    """The poses in a file, one or None for each scan."""
+    from cfr_jax.multiway.pose_files import read_poses
+
+    held = read_poses(path, names)
+    print(f"initial     poses of {len(held)} of {len(names)} scans")
+    return [held.get(name) for name in names]
 
 
 def _digest(path: Path | None) -> str | None:

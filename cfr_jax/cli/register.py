@@ -60,7 +60,11 @@ def add_parser(commands: Commands) -> None:
     parser.set_defaults(run=run)
     parser.add_argument("source", metavar="SOURCE", type=Path, help="the cloud that moves")
     parser.add_argument("target", metavar="TARGET", type=Path, help="the cloud that stays")
+    _add_outputs(parser)
+    _add_method(parser)
 
+
+def _add_outputs(parser: argparse.ArgumentParser) -> None:
     written = parser.add_argument_group("what to write")
     written.add_argument(
         "--out",
@@ -77,15 +81,20 @@ def add_parser(commands: Commands) -> None:
         "there",
     )
     written.add_argument(
-        "--view", metavar="PAGE.html", type=Path, help="a page that shows the result from all sides"
-    )
-    written.add_argument(
-        "--png",
-        metavar="PICTURE.png",
+        "--view",
+        metavar="FILE",
         type=Path,
-        help='before and after (pip install "cfr_jax[viz]")',
+        action="append",
+        help="the result to look at: .html is a page that shows it from all sides, .png a picture "
+        'of before and after (pip install "cfr_jax[viz]"), .rrd a recording for Rerun; may be '
+        "given more than once",
+    )
+    written.add_argument(  # its former name for pictures
+        "--png", dest="view", type=Path, action="append", help=argparse.SUPPRESS
     )
 
+
+def _add_method(parser: argparse.ArgumentParser) -> None:
     how = parser.add_argument_group("how to register")
     clouds.add_columns(how)
     after = how.add_mutually_exclusive_group()
@@ -94,19 +103,20 @@ def add_parser(commands: Commands) -> None:
         "--refine",
         metavar="WAY",
         default=True,
-        help="what refines it: "
-        + "; ".join(f"{name}, {refine.refinement(name).title}" for name in refine.names())
+        help="what refines the network's answer: "
+        + "; ".join(f"{name}, {refine.named(name).title}" for name in refine.names())
         + f"; or module:function (default: {refine.DEFAULT})",
     )
     flags.add(how, "--weights")
     where = how.add_mutually_exclusive_group()
     where.add_argument(
         "--initial",
-        metavar="T",
+        metavar="FILE",
         type=Path,
         action="append",
-        help="move the source by this 4x4 matrix first: .txt with 16 numbers, .npy, or .json (a "
-        "matrix, or what --json wrote); the answer includes it; given several times, all are tried",
+        help="move the source by the 4x4 matrix in this file first: .txt with 16 numbers, .npy, or "
+        ".json (a matrix, or what --json wrote); the answer includes it; given several times, all "
+        "are tried",
     )
     where.add_argument(
         "--global",
@@ -167,37 +177,35 @@ def run(args: argparse.Namespace) -> int:
             if names is not None:
                 document[role]["columns"] = list(names)
         _write_json(None if to_stdout else args.json, document)
-    if args.view is not None or args.png is not None:
-        pictures = [path for path in (args.view, args.png) if path is not None]
-        outputs.draw(report.as_scene(result), pictures)
+    if args.view is not None:
+        outputs.draw(report.as_scene(result), args.view)
 
     for warning in result.alignment.warnings if to_stdout else ():
         print(f"cfr register: warning: {warning}", file=sys.stderr)
     if not to_stdout:
         print(report.as_text(result))
-        for path in filter(None, (args.out, args.json, args.view, args.png)):
+        for path in filter(None, (args.out, args.json, *(args.view or ()))):
             print(f"wrote       {path}")
     return flags.UNSURE if args.strict and not result.alignment.trusted else 0
 
 
 def _check_outputs(args: argparse.Namespace, to_stdout: bool) -> None:
-    wanted = {
-        "--out": (args.out, outputs.cloud_suffixes()),
-        "--json": (None if to_stdout else args.json, ()),
-        "--view": (args.view, outputs.PAGE_SUFFIXES),
-        "--png": (args.png, outputs.PICTURE_SUFFIXES),
-    }
-    given = {option: (path, ends) for option, (path, ends) in wanted.items() if path is not None}
-    for option, (path, suffixes) in given.items():
+    wanted = [
+        ("--out", args.out, outputs.cloud_suffixes()),
+        ("--json", None if to_stdout else args.json, ()),
+        *(("--view", path, outputs.VIEW_SUFFIXES) for path in args.view or ()),
+    ]
+    given = [each for each in wanted if each[1] is not None]
+    for option, path, suffixes in given:
         outputs.check_output(option, path, suffixes)
-    inputs = [path for path in (args.source, args.target, *(args.initial or ()))]
-    outputs.check_apart(inputs, [path for path, _ in given.values()])
+    inputs = [args.source, args.target, *(args.initial or ())]
+    outputs.check_apart(inputs, [path for _, path, _ in given])
     chosen = refine.find(args.refine)
     library = None if chosen is None else chosen.library
     if library is not None and importlib.util.find_spec(library) is None:
         raise ValueError(f"--refine {args.refine} needs {library}: {optional.way_out(library)}")
-    if args.png is not None:
-        outputs.check_library("--png", args.png)
+    for path in args.view or ():
+        outputs.check_library("--view", path)
 
 
 def _write_json(path: Path | None, document: dict) -> None:

@@ -41,14 +41,11 @@ def add_parser(commands: Commands) -> None:
         metavar="FILE",
         type=Path,
         action="append",
-        help=f"what to write, by its suffix ({' '.join(_SUFFIXES)}); may be given more than once "
-        "(default: the name of the result, with .html)",
+        help=f"what to write, by its suffix ({' '.join(outputs.VIEW_SUFFIXES)}); may be given more "
+        "than once (default: the name of the result, with .html)",
     )
     for role in ("source", "target"):
         parser.add_argument(f"--{role}", metavar="FILE", type=Path, help=f"where the {role} is now")
-
-
-_SUFFIXES = (*outputs.PAGE_SUFFIXES, *outputs.PICTURE_SUFFIXES, *outputs.RECORDING_SUFFIXES)
 
 
 @clouds.telling("cfr view")
@@ -59,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         # perhaps the page of `cfr register --view`, which shows more
         raise ValueError(f"{wanted[0]} already exists: name the file to write with --out")
     for path in wanted:
-        outputs.check_output("--out", path, _SUFFIXES)
+        outputs.check_output("--out", path, outputs.VIEW_SUFFIXES)
         outputs.check_library("--out", path)
     given = [path for path in (args.result, args.source, args.target) if path is not None]
     outputs.check_apart(given, wanted)

@@ -22,8 +22,8 @@ from jaxtyping import Float, Float32, Int
 
 from cfr_jax.data.hdf5 import reading as hdf5
 from cfr_jax.io.cloud import LARGEST_COORDINATE
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import text
-from cfr_jax.runtime.words import Refused, shown
 
 _LARGEST_LABEL = 65_535  # where no file lists the categories
 _LARGEST_LIST = 1 << 20  # bytes

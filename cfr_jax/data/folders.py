@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from cfr_jax.io.formats import Format, by_suffix
+from cfr_jax.runtime.messages import Refused
 from cfr_jax.runtime.reading import opened
-from cfr_jax.runtime.words import Refused
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 _START = 4096  # bytes that are enough to see whether a file has faces

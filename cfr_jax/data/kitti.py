@@ -29,9 +29,9 @@ from cfr_jax.data.perturbations import random_motion, resample
 from cfr_jax.data.scans import estimate_normals, refine_point_to_plane, voxel_mean
 from cfr_jax.geometry import motions
 from cfr_jax.runtime.atomic import unfinished
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.progress import Progress
 from cfr_jax.runtime.reading import text
-from cfr_jax.runtime.words import Refused, shown
 
 VOXEL = 0.3  # m
 NORMAL_RADIUS = 3.0  # m

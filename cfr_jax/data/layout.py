@@ -9,8 +9,8 @@ from pathlib import Path
 
 from cfr_jax.data import kinds
 from cfr_jax.data.kinds.kind import DataKind
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import irregular
-from cfr_jax.runtime.words import Refused, shown
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,16 @@ def recognize(path: str | Path, kind: str | None = None) -> Layout:
     """
     path = Path(path)
     if kind is not None:
-        chosen = kinds.named(kind, "layout", kinds.known())
+        chosen = kinds.named(kind, "layout", kinds.entries())
         if (found := chosen.recognize(_existing(path))) is not None:
             return Layout(chosen, path, found)
         raise ValueError(f"{path} does not have the layout of {kind}: it holds {_contents(path)}")
     _existing(path)
-    for each in kinds.known():
+    for each in kinds.entries():
         found = each.recognize(path)
         if found is not None and not (each.unlikely is not None and each.unlikely(path)):
             return Layout(each, path, found)
-    *words, last = (each.words for each in kinds.known())
+    *words, last = (each.words for each in kinds.entries())
     raise ValueError(
         f"{path} does not hold data of a known kind: it holds {_contents(path)}\n"
         f"wanted {', '.join(words)}, or {last}"

@@ -172,7 +172,7 @@ def _named(given: Any, where: str) -> dict[str, dict[str, Any]]:
 
 def _open(about: dict[str, Any], cache: Path, where: str) -> TrainingSource:
     name, path = about.pop("kind", "corpus"), about.pop("path", None)
-    able = [kind for kind in kinds.known() if kind.train is not None]
+    able = [kind for kind in kinds.entries() if kind.train is not None]
     if name != "auto":
         kind = kinds.named(name, f"{where}.kind", able)
     if path is None or not str(path):

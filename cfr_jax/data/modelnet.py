@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from cfr_jax.data.corpus import Corpus, read_corpus
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import text
-from cfr_jax.runtime.words import Refused, shown
 
 Split = Literal["train", "val", "test"]
 

@@ -153,7 +153,7 @@ def _of_pairs(
 def _errors_of(m: Measured, index: int) -> dict[str, Any]:
     """The errors of one pair by each metric of the table, per iteration or for the answer."""
     told: dict[str, Any] = {}
-    for metric in metrics.table():
+    for metric in metrics.entries():
         if not any(summary.title for summary in metric.summaries):
             continue
         errors = m.errors.get(metric.name)

@@ -44,7 +44,7 @@ def read_pairs(data: Mapping[str, Any], limit: int, cache: Path) -> list[Pair]:
 def _chosen(data: Mapping[str, Any]) -> DataKind:
     if missing := sorted({"kind", "path"} - set(data)):
         raise ValueError(f"data lacks {', '.join(missing)}, which all data need")
-    able = [kind for kind in kinds.known() if kind.evaluate is not None]
+    able = [kind for kind in kinds.entries() if kind.evaluate is not None]
     if data["kind"] != "auto":
         return kinds.named(data["kind"], "data.kind", able)
     layout = recognize(data["path"])

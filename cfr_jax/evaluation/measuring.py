@@ -78,7 +78,7 @@ def measure(name: str, records: Records, pairs: Sequence[Pair]) -> Measured:
     whole = all(pair.clean_source is not None and pair.clean_target is not None for pair in pairs)
     errors = {
         metric.name: np.full((len(pairs), iterations if metric.each_iteration else 1), np.nan)
-        for metric in metrics.table()
+        for metric in metrics.entries()
         if whole or not metric.whole_shapes
     }
     seconds = np.full(len(pairs), np.nan)
@@ -86,7 +86,7 @@ def measure(name: str, records: Records, pairs: Sequence[Pair]) -> Measured:
         told = records.by_pair[index].seconds
         seconds[index] = np.nan if told is None else told
         for metric_name, each in errors.items():
-            of = metrics.metric(metric_name)
+            of = metrics.named(metric_name)
             each[index] = of.of(estimates if of.each_iteration else estimates[-1:], pairs[index])
     return Measured(
         name=name,
@@ -119,7 +119,7 @@ def summarize(
     """
     answered = measured.answered
     numbers: dict[str, Statistic | None] = {}
-    for metric in metrics.table():
+    for metric in metrics.entries():
         errors = measured.errors.get(metric.name)
         values = np.zeros(0) if errors is None else errors[answered, -1]
         for summary in metric.summaries:

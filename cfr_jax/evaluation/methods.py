@@ -95,7 +95,7 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
 
         own = entry.weights or (None if use == OWN else getattr(config, f"{use}_weights", ""))
         if own == "":
-            title = table.network(use).title
+            title = table.named(use).title
             raise ValueError(f"methods.{name}.weights: got none, wanted weights of {title}")
         chosen = own or config.weights
         try:
@@ -107,7 +107,7 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
         about |= {"weights": weights.name, "sha256": weights.sha256, "seed": seed}
         make = functools.partial(
             _make_own,
-            network=table.network(use),
+            network=table.named(use),
             weights=chosen,
             estimated=estimated,
             batch=batch,
@@ -116,7 +116,7 @@ def _method(name: str, config: EvaluationConfig, seed: int) -> Method:
         )
         if entry.modules:
             modules = functools.partial(
-                _make_modules, table.network(use), chosen, options.get("settings"), estimated
+                _make_modules, table.named(use), chosen, options.get("settings"), estimated
             )
     elif use == TRUTH:
         check_none(where, use, options)

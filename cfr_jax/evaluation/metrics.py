@@ -219,12 +219,12 @@ _ALL = (
 _TABLE = {metric.name: metric for metric in _ALL}
 
 
-def table() -> tuple[Metric, ...]:
+def entries() -> tuple[Metric, ...]:
     """All metrics, in the order of the columns."""
     return tuple(_TABLE.values())
 
 
-def metric(name: str) -> Metric:
+def named(name: str) -> Metric:
     """The metric of that name; raises KeyError for an unknown name."""
     return _TABLE[name]
 

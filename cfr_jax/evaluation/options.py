@@ -32,7 +32,7 @@ def check_network(where: str, use: str, options: Mapping[str, Any]) -> None:
 
     _check(where, use, options, _parameters(make_network), _OF_NETWORKS)
     settings = options.get("settings") or {}
-    known = [field.name for field in dataclasses.fields(table.network(use).settings)]
+    known = [field.name for field in dataclasses.fields(table.named(use).settings)]
     if unknown := sorted(set(settings) - set(known)):
         raise ValueError(
             f"{where}.settings: got {', '.join(unknown)}, wanted some of {', '.join(known)}"

@@ -86,7 +86,7 @@ def missed(measured: Scores, expected: Scores, tolerance: dict[str, float]) -> l
 
 
 def _scores(err_r: np.ndarray, err_t: np.ndarray) -> dict[str, float]:
-    rotations = metrics.metric("err_r").summaries
+    rotations = metrics.named("err_r").summaries
     scores = {summary.name: float(summary.statistic(err_r, axis=-1)) for summary in rotations}
     for threshold in ((1.0, 0.02), (5.0, 0.1)):
         summary = metrics.recall(*threshold)

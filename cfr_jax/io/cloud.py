@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float64, Real
 
-from cfr_jax.runtime.words import Refused
+from cfr_jax.runtime.messages import Refused
 
 if TYPE_CHECKING:
     from cfr_jax.io.table import Table

@@ -19,7 +19,7 @@ from cfr_jax.io.naming import checked_columns
 from cfr_jax.io.table import table_of_mesh
 from cfr_jax.runtime import reading
 from cfr_jax.runtime.atomic import unfinished
-from cfr_jax.runtime.words import Refused, shown
+from cfr_jax.runtime.messages import Refused, shown
 
 
 def read(
@@ -60,7 +60,7 @@ def read(
     if samples is not None and samples < 0:
         raise ValueError(f"samples must be 0 or more, got {samples}")
     named = checked_columns(columns)
-    shape = read_shape(path, formats.known(), columns=named, whole=properties)
+    shape = read_shape(path, formats.entries(), columns=named, whole=properties)
     if properties and isinstance(shape, Mesh) and shape.table is None:
         shape = replace(shape, table=table_of_mesh(shape))
     try:

@@ -28,8 +28,8 @@ class Table:
         values: arrays (n,) or (n, k), of the file's own types.
         roles: which columns are points and normals.
         polygons: the faces between the rows, if the file has any.
-        rest: what only the format `source` can write again: other elements, headers, arrays.
-        source: the name of the format that this comes from.
+        rest: what only this format can write again: other elements, headers, arrays.
+        format: the name of the format that this comes from.
     """
 
     names: tuple[str, ...]
@@ -38,7 +38,7 @@ class Table:
     named: bool = True
     polygons: Polygons | None = None
     rest: Any = None
-    source: str = ""
+    format: str = ""
 
     @property
     def is_bare(self) -> bool:
@@ -107,23 +107,23 @@ def table_of(
     *,
     polygons: Polygons | None = None,
     rest: Any = None,
-    source: str = "",
+    format: str = "",
 ) -> Table:
     """A table of named columns; `columns` are other names that the user gave."""
     names = renamed(names, columns)
-    return Table(tuple(names), tuple(values), roles_of(names), True, polygons, rest, source)
+    return Table(tuple(names), tuple(values), roles_of(names), True, polygons, rest, format)
 
 
 def unnamed_table(
-    values: Sequence[np.ndarray], columns: Sequence[str] | None = None, *, source: str = ""
+    values: Sequence[np.ndarray], columns: Sequence[str] | None = None, *, format: str = ""
 ) -> tuple[Table, tuple[str, ...]]:
     """A table of columns without names unless the user gave some, and notes on what it means."""
     names = [f"column_{k + 1}" for k in range(len(values))]
     if columns is not None:
         names = renamed(names, columns)
-        return Table(tuple(names), tuple(values), roles_of(names), False, source=source), ()
+        return Table(tuple(names), tuple(values), roles_of(names), False, format=format), ()
     roles, notes = roles_of_unnamed(values)
-    return Table(tuple(names), tuple(values), roles, False, source=source), notes
+    return Table(tuple(names), tuple(values), roles, False, format=format), notes
 
 
 def plain_table(cloud: PointCloud) -> Table:

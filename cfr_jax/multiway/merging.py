@@ -17,7 +17,7 @@ from cfr_jax.multiway.answers import Fused, Merged
 from cfr_jax.multiway.building import build, refined
 from cfr_jax.multiway.choosing import Try
 from cfr_jax.multiway.fusing import fuse_models
-from cfr_jax.multiway.registering import CLOSURE, NEAR, Kept, Memory, Options, Registrar
+from cfr_jax.multiway.registering import CLOSURE, NEAR, Memory, Options, RecordStore, Registrar
 from cfr_jax.multiway.reporting import answer
 from cfr_jax.multiway.scans import LeftOut, Scan, load, names_of, of_other_sizes, twins
 from cfr_jax.multiway.searching import closures, searched
@@ -40,7 +40,7 @@ def merge(
     seed: int = 0,
     batch: int | None = None,
     workers: int | None = None,
-    kept: Kept | None = None,
+    kept: RecordStore | None = None,
     progress: bool = False,
 ) -> Merged:
     """Merges many scans of one thing: finds the pose of each scan, and makes one cloud.
@@ -62,9 +62,9 @@ def merge(
     scan). Each component gets a merged cloud with one point for each cube of size `voxel` (default:
     the spacing of the scans' points), unless `fused` is False.
 
-    `kept` stores the registrations and is looked up first (`batch.journal.Journal`), so a run that
-    was killed continues where it stopped. `max_points`, `seed`, `batch` and `workers` are those of
-    `align_many`. The same call gives the same answer.
+    `kept` stores the registrations and is looked up first, so a run that was killed continues where
+    it stopped if `kept` is a file, such as a `batch.journal.Journal`. `max_points`, `seed`, `batch`
+    and `workers` are those of `align_many`. The same call gives the same answer.
 
     Raises ValueError for options that cannot be used, and if fewer than two scans can be merged.
     """
@@ -112,7 +112,7 @@ def register_share(
     clouds: Sequence[Any],
     rows: slice,
     *,
-    kept: Kept,
+    kept: RecordStore,
     sequence: bool = False,
     guesses: Sequence[Float[np.ndarray, "4 4"] | None] | None = None,
     progress: bool = False,
@@ -148,7 +148,7 @@ def _start(
     clouds: list[Any],
     sequence: bool,
     guesses: Sequence[Float[np.ndarray, "4 4"] | None] | None,
-    kept: Kept,
+    kept: RecordStore,
     progress: bool,
     options: Options,
 ) -> _Start:

@@ -34,7 +34,7 @@ class Options(TypedDict, total=False):
 
 
 @runtime_checkable
-class Kept(Protocol):
+class RecordStore(Protocol):
     """A store of records, such as `batch.journal.Journal`."""
 
     def __contains__(self, key: tuple[str, str, int]) -> bool: ...
@@ -56,7 +56,9 @@ class Memory(dict[tuple[str, str, int], Record]):
 class Registrar:
     """Registers pairs of scans, and skips those that are already done."""
 
-    def __init__(self, scans: Mapping[int, Scan], kept: Kept, options: Options, *, progress: bool):
+    def __init__(
+        self, scans: Mapping[int, Scan], kept: RecordStore, options: Options, *, progress: bool
+    ):
         self._scans, self._kept = scans, kept
         self._options, self._progress = options, progress
 

@@ -25,7 +25,9 @@ from cfr_jax.networks.extraction import pooled_features
 from cfr_jax.networks.features import raw_features
 from cfr_jax.networks.inputs import Cloud, moved_by
 from cfr_jax.networks.layers import GROUPS, apply_layer, kernel_init, layer_of, unit_rows
-from cfr_jax.networks.parts import (
+from cfr_jax.networks.record import Checkpoint, Network, Params, Part, Place, Step, places_of
+from cfr_jax.networks.sinkhorn import Affinity, Form, match
+from cfr_jax.networks.timed_parts import (
     ANNEALING,
     FEATURES,
     MATCHING,
@@ -34,8 +36,6 @@ from cfr_jax.networks.parts import (
     matching,
     move,
 )
-from cfr_jax.networks.record import Checkpoint, Network, Params, Part, Place, Step, places_of
-from cfr_jax.networks.sinkhorn import Affinity, Form, match
 
 _WIDTHS = (96, 96, 192)
 _CHANNELS = 96

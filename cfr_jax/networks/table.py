@@ -35,7 +35,7 @@ def names() -> tuple[str, ...]:
     return (*_BUILT_IN, *_registered)
 
 
-def network(name: str) -> Network:
+def named(name: str) -> Network:
     """The record of a network; raises a ValueError that lists all names for an unknown one."""
     if name in _registered:
         return _registered[name]
@@ -67,9 +67,9 @@ def have(record: Network) -> None:
 
 def recognize(tensors: Collection[str]) -> Network:
     """The network whose weights have tensors of these names; raises ValueError if none does."""
-    for record in map(network, names()):
+    for record in map(named, names()):
         if record.recognizes(tensors):
             return record
-    titles = ", ".join(record.title for record in map(network, names()))
+    titles = ", ".join(record.title for record in map(named, names()))
     some = ", ".join(sorted(tensors)[:3]) or "none"
     raise ValueError(f"no known network ({titles}) has these tensors: {some}")

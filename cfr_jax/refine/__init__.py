@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from cfr_jax.runtime.optional import require
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from cfr_jax.refine.surfaces import Fit
 
 DEFAULT = "own"
+# What an option `refine` takes. The literals let editors complete the names in the table.
+Refine = bool | Literal["own", "small_gicp", "all_points", "pyramid"] | str
 
 
 @dataclass(frozen=True)
@@ -70,11 +72,14 @@ _TABLE = {
     each.name: each
     for each in (
         Refinement(
-            DEFAULT, "our own generalized ICP", f"{_HERE}.generalized_icp:refine", traceable=True
+            DEFAULT,
+            "the generalized ICP of cfr_jax",
+            f"{_HERE}.generalized_icp:refine",
+            traceable=True,
         ),
         Refinement(
             "small_gicp",
-            "generalized ICP of the library small_gicp",
+            "the generalized ICP of the library small_gicp",
             f"{_HERE}.small_gicp:refine",
             library="small_gicp",
         ),
@@ -86,7 +91,7 @@ _TABLE = {
         ),
         Refinement(
             "pyramid",
-            "our own generalized ICP on all points, from coarse to fine",
+            "the generalized ICP of cfr_jax on all points, from coarse to fine",
             f"{_HERE}.pyramid:refine",
             every_point=True,
         ),
@@ -111,7 +116,7 @@ def add(refinement: Refinement) -> None:
     _TABLE[refinement.name] = refinement
 
 
-def refinement(name: str) -> Refinement:
+def named(name: str) -> Refinement:
     """The refinement with this name.
 
     "module:function" names any importable function, which then runs on the host. This is how
@@ -128,12 +133,12 @@ def refinement(name: str) -> Refinement:
     )
 
 
-def find(refine: bool | str) -> Refinement | None:
+def find(refine: Refine) -> Refinement | None:
     """The refinement that an option asks for: the named one, the default for True, or None for
     False."""
     if isinstance(refine, bool):
-        return refinement(DEFAULT) if refine else None
-    return refinement(refine)
+        return named(DEFAULT) if refine else None
+    return named(refine)
 
 
 def _elsewhere(place: str) -> Refinement:

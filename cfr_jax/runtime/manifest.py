@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+from cfr_jax.runtime.messages import Refused
 from cfr_jax.runtime.reading import contents, opened, parse_json
-from cfr_jax.runtime.words import Refused
 
 NAME = "manifest.json"
 Read = TypeVar("Read")

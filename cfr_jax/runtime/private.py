@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from cfr_jax.runtime.words import Refused, shown
+from cfr_jax.runtime.messages import Refused, shown
 
 
 def make_private(folder: Path) -> None:

@@ -24,8 +24,8 @@ import jaxlib
 from jax import export as jax_export
 
 from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.runtime.checksums import sealed, unsealed
 from cfr_jax.runtime.private import make_private
-from cfr_jax.runtime.seals import sealed, unsealed
 
 _UNUSED = 30 * 24 * 3600.0  # seconds without use after which a program is deleted
 _places: list[Path] = []  # the folder that programs are kept in; empty means none

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from io import BufferedReader
 from typing import Any
 
-from cfr_jax.runtime.words import Refused
+from cfr_jax.runtime.messages import Refused
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),

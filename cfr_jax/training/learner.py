@@ -32,7 +32,7 @@ def learner(config: TrainingConfig) -> Learner:
 
     Raises ValueError for an unknown name, and for `config.settings` that the network does not have.
     """
-    record, changed = table.network(config.network), config.settings
+    record, changed = table.named(config.network), config.settings
     _check_settings(record, changed)
     of_training = dict(changed)
     if config.train.precision == "bfloat16":

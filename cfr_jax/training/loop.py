@@ -13,10 +13,10 @@ import numpy as np
 from cfr_jax.training import devices, identity, optimizers, step, stopping, validation
 from cfr_jax.training.checkpoints import Checkpoints
 from cfr_jax.training.config import Phase, TrainingConfig
-from cfr_jax.training.drawing import Drawing, Leg, make_drawing
-from cfr_jax.training.drawing.device import DeviceDrawing
 from cfr_jax.training.learner import remaining
 from cfr_jax.training.reporting.reporter import Reporter
+from cfr_jax.training.sampling import Drawing, Leg, make_drawing
+from cfr_jax.training.sampling.device import DeviceDrawing
 from cfr_jax.training.step import TrainState
 from cfr_jax.training.task import Task, fresh_params, prepare
 from cfr_jax.weights.files import save_params

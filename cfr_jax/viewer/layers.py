@@ -20,7 +20,7 @@ _GOLDEN = 0.618034  # of a turn of the color wheel from one layer to the next: n
 
 
 @dataclass(frozen=True, eq=False)
-class Layer:
+class CloudLayer:
     """A cloud in the frame that all layers share."""
 
     name: str
@@ -29,7 +29,7 @@ class Layer:
 
 def write_layers(
     path: str | os.PathLike[str],
-    layers: Sequence[Layer],
+    layers: Sequence[CloudLayer],
     *,
     title: str = "model",
     max_points: int = 120_000,

@@ -22,8 +22,8 @@ from cfr_jax.networks.clues import NetworkClues
 from cfr_jax.networks.probability import KEY, Calibration, calibration_of, uncalibrated
 from cfr_jax.networks.record import Network, Params
 from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import contents, parse_json
-from cfr_jax.runtime.words import Refused, shown
 
 SHIPPED = Path(__file__).parent / "shipped"
 DEFAULT = "object"
@@ -155,7 +155,7 @@ def read_weights(source: str | Path = DEFAULT, network: str | None = None) -> We
     except ValueError as error:
         raise Refused(f"{where}: {error}") from error
     if network not in (None, record.name):
-        wanted = table.network(network).title
+        wanted = table.named(network).title
         raise Refused(f"{where} holds the network {record.title}, wanted {wanted}")
     wide = {
         name: value.astype(np.float32) if value.dtype == np.float16 else value

@@ -24,9 +24,9 @@ from cfr_jax.networks.cfr.registration import register
 from cfr_jax.networks.inputs import Settings, prepare
 from cfr_jax.networks.record import Params
 from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.runtime.checksums import sealed, unsealed
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import contents
-from cfr_jax.runtime.seals import sealed, unsealed
-from cfr_jax.runtime.words import Refused, shown
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 OUTPUTS = ("transform", "transforms", "weights", "covered")

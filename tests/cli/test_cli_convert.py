@@ -11,7 +11,7 @@ from oracle.authors import random_rpmnet_state_dict, random_state_dict
 from cfr_jax import align
 from cfr_jax.cli import main
 from cfr_jax.geometry import motions
-from cfr_jax.weights.authors import from_state_dict
+from cfr_jax.weights.conversion import from_state_dict
 from cfr_jax.weights.files import SHIPPED, read_weights
 
 

@@ -261,9 +261,9 @@ def test_all_outputs_are_written_and_named(pair, tmp_path, answering, capsys):
         "--out": "moved.pcd",
         "--json": "result.json",
         "--view": "page.html",
-        "--png": "picture.png",
     }
     options = [text for option, name in files.items() for text in (option, str(tmp_path / name))]
+    options += ["--view", str(tmp_path / "picture.png")]
 
     # when
     code = main(["register", *pair, *options])
@@ -271,12 +271,12 @@ def test_all_outputs_are_written_and_named(pair, tmp_path, answering, capsys):
     # then
     out = capsys.readouterr().out
     assert code == 0
-    for name in files.values():
+    for name in (*files.values(), "picture.png"):
         assert (tmp_path / name).stat().st_size > 500
         assert f"wrote       {tmp_path / name}" in out
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
     assert b"source.ply" in (tmp_path / "page.html").read_bytes()
-    assert len(list(tmp_path.iterdir())) == 2 + len(files)
+    assert len(list(tmp_path.iterdir())) == 3 + len(files)
 
 
 @pytest.mark.parametrize("strict", [True, False])
@@ -297,8 +297,8 @@ def test_only_strict_makes_a_doubtful_answer_a_failure(changes, strict, pair, an
         (["--out", "source.ply"], "source.ply would be overwritten"),
         (["--out", "./link.ply"], "link.ply would be overwritten"),
         (["--json", "x.ply", "--out", "x.ply"], "x.ply would be overwritten"),
-        (["--view", "page.png"], "--view"),
-        (["--png", "picture.html"], "--png"),
+        (["--view", "page.pdf"], "--view"),
+        (["--view", "page.html", "--view", "./page.html"], "page.html would be overwritten"),
         (["--json", "/dev/null"], "not a regular file"),
         (["--initial", "missing.npy"], "missing.npy: cannot be read"),
         (["--weights", "nosuch"], "nosuch"),
@@ -326,9 +326,12 @@ def test_what_cannot_be_used_is_refused_before_anything_is_computed(
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_a_picture_without_matplotlib_is_refused_with_the_way_out(pair, monkeypatch, capsys):
+@pytest.mark.parametrize("option", ["--view", "--png"])  # the second is the former name
+def test_a_picture_without_matplotlib_is_refused_with_the_way_out(
+    option, pair, monkeypatch, capsys
+):
     monkeypatch.setattr("cfr_jax.cli.shared.outputs.can_draw", lambda: False)
-    assert main(["register", *pair, "--png", "picture.png"]) == 2
+    assert main(["register", *pair, option, "picture.png"]) == 2
     assert 'pip install "cfr_jax[viz]"' in capsys.readouterr().err
 
 

@@ -58,7 +58,7 @@ def make(kind, folder):
     return folder
 
 
-@pytest.mark.parametrize("kind", [kind.name for kind in kinds.known()])
+@pytest.mark.parametrize("kind", [kind.name for kind in kinds.entries()])
 def test_every_kind_is_recognized_and_described(kind, tmp_path):
     found = recognize(make(kind, tmp_path))
     assert found.kind.name == kind and str(tmp_path) in str(found)

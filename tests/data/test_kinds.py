@@ -27,7 +27,7 @@ from cfr_jax.evaluation.datasets import read_pairs
 from cfr_jax.training.task import prepare
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-NAMES = [kind.name for kind in kinds.known()]
+NAMES = [kind.name for kind in kinds.entries()]
 
 
 def scans_of(folder: Path) -> list[tuple[str, np.ndarray]]:
@@ -84,7 +84,7 @@ def survey(monkeypatch, tmp_path):
 
     Without that kind, its files look like a folder of clouds.
     """
-    monkeypatch.setattr(kinds, "_KINDS", list(kinds.known()))
+    monkeypatch.setattr(kinds, "_KINDS", list(kinds.entries()))
     kinds.add(SURVEY)
     folder = tmp_path / "survey"
     folder.mkdir()
@@ -163,7 +163,7 @@ def test_a_name_can_be_used_only_once():
     for name in ("kitti", "auto"):
         with pytest.raises(ValueError, match=f"name: '{name}' is taken"):
             kinds.add(DataKind(name=name, words="", recognize=lambda _: None))
-    assert [kind.name for kind in kinds.known()] == NAMES
+    assert [kind.name for kind in kinds.entries()] == NAMES
 
 
 def test_what_is_no_kind_and_a_kind_that_recognizes_nothing_are_refused(unchecked):
@@ -192,7 +192,7 @@ def test_data_that_cannot_be_trained_on_is_refused_by_name_and_by_layout(tmp_pat
         open_mixture({"a": about}, tmp_path, "data.train")
 
 
-@pytest.mark.parametrize("kind", kinds.known(), ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", kinds.entries(), ids=lambda kind: kind.name)
 def test_the_example_of_a_kind_has_all_its_settings(kind):
     assert (kind.evaluate is None) == (not kind.example)
     if kind.evaluate is not None:

@@ -189,7 +189,7 @@ def test_what_an_ablation_trains_is_what_it_measures():
         assert len(config.methods) == len(variants) == 2
         for method, (run, settings) in variants.items():
             entry = config.methods[method]
-            made = make_network(network=table.network("cfr"), weights="object", **entry.options)
+            made = make_network(network=table.named("cfr"), weights="object", **entry.options)
             measured = made.args[1].settings
             if run:
                 assert run in evaluations.trainings(name)

@@ -447,7 +447,7 @@ def test_a_batch_answers_as_each_pair_alone(tmp_path, params, cascades):
     save_params(tmp_path / "w.safetensors", params)
     pairs = [a_pair(seed, points=70) for seed in range(3)]
     solve = make_network(
-        network=table.network("cfr"),
+        network=table.named("cfr"),
         weights=str(tmp_path / "w.safetensors"),
         refine=False,
         batch=2,
@@ -485,7 +485,7 @@ def test_clouds_of_any_size_go_through_align(monkeypatch):
 
     # when
     solve = network_solver.make_network(
-        network=table.network("cfr"),
+        network=table.named("cfr"),
         weights="w",
         refine=True,
         through="align",
@@ -508,11 +508,11 @@ def test_a_network_goes_through_register_or_align_and_nothing_else(unchecked):
 
     with pytest.raises(ValueError, match="through is 'luck'"):
         network_solver.make_network(
-            network=table.network("cfr"), weights="w", refine=True, through="luck"
+            network=table.named("cfr"), weights="w", refine=True, through="luck"
         )
     with pytest.raises(ValueError, match="cascades is 0"):
         network_solver.make_network(
-            network=table.network("cfr"), weights="w", refine=True, cascades=0
+            network=table.named("cfr"), weights="w", refine=True, cascades=0
         )
 
 
@@ -521,14 +521,14 @@ def a_network(tmp_path, network: str, **options):
     from oracle import authors
 
     from cfr_jax.evaluation.solvers.network_solver import make_network
-    from cfr_jax.weights.authors import from_state_dict
+    from cfr_jax.weights.conversion import from_state_dict
     from cfr_jax.weights.files import save_params
 
     made = {"cfr": authors.random_state_dict, "rpmnet": authors.random_rpmnet_state_dict}[network]
     params = from_state_dict(made(0))
     save_params(tmp_path / "w.safetensors", params)
     solve = make_network(
-        network=table.network(network),
+        network=table.named(network),
         weights=str(tmp_path / "w.safetensors"),
         refine=False,
         **options,
@@ -615,7 +615,7 @@ def test_the_modules_that_are_timed_are_those_of_a_registration(tmp_path, networ
 
     from cfr_jax.evaluation.solvers import module_times
     from cfr_jax.geometry import rigid
-    from cfr_jax.networks import inputs, parts, rpmnet
+    from cfr_jax.networks import inputs, rpmnet, timed_parts
     from cfr_jax.networks.cfr import iterations
 
     # given the parts of a registration of one iteration
@@ -633,10 +633,10 @@ def test_the_modules_that_are_timed_are_those_of_a_registration(tmp_path, networ
         (motion,) = motions(rpmnet.unroll, params, source, target, small)
 
     # when the last part is run
-    *_, last = table.network(network).parts(params, small)(source, target)
+    *_, last = table.named(network).parts(params, small)(source, target)
 
     # then it leaves the source where a registration does
-    assert last.module == parts.MOTION
+    assert last.module == timed_parts.MOTION
     wanted = rigid.apply(jnp.asarray(motion), source.points)
     np.testing.assert_allclose(last.function(*last.arguments), wanted, atol=1e-5)
 
@@ -660,12 +660,12 @@ def test_each_module_is_counted_as_often_as_a_registration_runs_it(
 
     from cfr_jax.evaluation.solvers import module_times
     from cfr_jax.geometry import rigid
-    from cfr_jax.networks import parts, rpmnet
+    from cfr_jax.networks import rpmnet, timed_parts
     from cfr_jax.networks.cfr import iterations
 
     # given how often each module of a registration is to be timed
     _, params = a_network(tmp_path, network)
-    record = table.network(network)
+    record = table.named(network)
     chosen = record.settings(neighbors=8, **settings)
     clouds = module_times._clouds(a_pair(), estimated=True)
     counted = Counter()
@@ -701,11 +701,11 @@ def test_each_module_is_counted_as_often_as_a_registration_runs_it(
     else:
         searches, features = ran["search"], ran["Features", "__call__"]
     assert counted == {
-        parts.NEIGHBORS: searches,
-        parts.FEATURES: features,
-        parts.ANNEALING: ran["AnnealingNet", "__call__"],
-        parts.MATCHING: ran["match"],
-        parts.MOTION: ran["fit"],
+        timed_parts.NEIGHBORS: searches,
+        timed_parts.FEATURES: features,
+        timed_parts.ANNEALING: ran["AnnealingNet", "__call__"],
+        timed_parts.MATCHING: ran["match"],
+        timed_parts.MOTION: ran["fit"],
     }
     assert ran["match"] == 5
 

@@ -116,14 +116,14 @@ def test_who_looks_an_entry_up_cannot_change_it(entry):
 
 
 def test_a_column_says_what_its_numbers_are_multiplied_by_where_they_are():
-    titles = {name: metrics.metric(name).summaries[0].title for name in ("err_r", "chamfer")}
+    titles = {name: metrics.named(name).summaries[0].title for name in ("err_r", "chamfer")}
 
     assert titles == {"err_r": "RE mean", "chamfer": "CD mean ×1000"}
 
 
 @pytest.mark.parametrize("name", ["r_mae", "r_rmse", "t_mae", "t_rmse"])
 def test_pairs_are_summed_up_as_their_axes_are(name):
-    (summary,) = metrics.metric(name).summaries
+    (summary,) = metrics.named(name).summaries
 
     found = summary.statistic(np.array([3.0, 4.0]), axis=0)
 
@@ -131,14 +131,14 @@ def test_pairs_are_summed_up_as_their_axes_are(name):
 
 
 def test_all_summaries_have_names_of_their_own_and_say_which_way_is_better():
-    names = [summary.name for metric in metrics.table() for summary in metric.summaries]
+    names = [summary.name for metric in metrics.entries() for summary in metric.summaries]
 
     assert len(set(names)) == len(names) == 10
     assert all(metrics.lower_is_better(name) for name in names)
     assert not metrics.lower_is_better(metrics.recall(5.0, 0.1).name)
 
 
-@pytest.mark.parametrize("metric", metrics.table(), ids=lambda metric: metric.name)
+@pytest.mark.parametrize("metric", metrics.entries(), ids=lambda metric: metric.name)
 def test_no_metric_finds_an_error_in_the_truth(metric):
     points = np.random.default_rng(0).normal(size=(30, 3))
     truth = solids.motion(30, translation=(0.1, 0.2, 0.3))

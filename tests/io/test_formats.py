@@ -46,7 +46,7 @@ def parse_toy_mesh(data: bytes, name: str, folder: Path) -> Mesh:
 @pytest.fixture
 def toys(monkeypatch):
     """The table with a format of clouds and one of surfaces more, for one test."""
-    monkeypatch.setattr(formats, "_FORMATS", list(formats.known()))
+    monkeypatch.setattr(formats, "_FORMATS", list(formats.entries()))
     formats.add(Format("toy", (".toy",), "cloud", parse_toy, save_toy, note="a toy"))
     formats.add(Format("toy mesh", (".toym",), "surface", parse_toy_mesh, needs_folder=True))
 
@@ -131,7 +131,7 @@ def test_folders_of_a_format_from_outside_are_recognized(toys, tmp_path):
 
 def test_an_unknown_suffix_is_answered_with_all_known_ones(toys, tmp_path):
     (tmp_path / "cloud.abc").touch()
-    listed = " ".join(formats.by_suffix(formats.known()))
+    listed = " ".join(formats.by_suffix(formats.entries()))
     assert listed.startswith(".ply .pcd ") and listed.endswith(" .toy .toym")
     with pytest.raises(CloudFileError, match=f"wanted one of {re.escape(listed)}$"):
         read(tmp_path / "cloud.abc")
@@ -151,10 +151,10 @@ def test_an_unknown_suffix_is_answered_with_all_known_ones(toys, tmp_path):
 )
 def test_a_format_that_does_not_fit_is_refused(unchecked, changes, message):
     about = {"name": "mine", "suffixes": (".new",), "holds": "cloud", "parse": parse_toy}
-    before = formats.known()
+    before = formats.entries()
     with pytest.raises(ValueError, match=message):
         formats.add(Format(**(about | changes)))
-    assert formats.known() == before
+    assert formats.entries() == before
 
 
 def test_what_is_no_format_is_refused(unchecked):
@@ -162,7 +162,7 @@ def test_what_is_no_format_is_refused(unchecked):
         formats.add(".toy")
 
 
-@pytest.mark.parametrize("form", formats.known(), ids=lambda form: form.name)
+@pytest.mark.parametrize("form", formats.entries(), ids=lambda form: form.name)
 def test_every_format_of_the_table_has_what_the_table_names(form, tmp_path):
     folder = (tmp_path,) if form.needs_folder else ()
     with pytest.raises(ValueError):
@@ -192,8 +192,8 @@ sys.exit(f"{heavy}" if heavy else "jax" in sys.modules)
 @pytest.mark.parametrize(
     ("page", "listed"),
     [
-        ("files.md", formats.known()),
-        ("train-on-your-data.md", [form for form in formats.known() if form.loose]),
+        ("files.md", formats.entries()),
+        ("train-on-your-data.md", [form for form in formats.entries() if form.loose]),
     ],
 )
 def test_the_pages_list_every_format(page, listed):

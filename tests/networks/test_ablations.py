@@ -9,7 +9,7 @@ from oracle import authors, cfr, clouds
 from cfr_jax.networks.cfr.iterations import iterations_of
 from cfr_jax.networks.cfr.modules import init_params
 from cfr_jax.networks.cfr.registration import Settings, register
-from cfr_jax.weights.authors import from_state_dict
+from cfr_jax.weights.conversion import from_state_dict
 
 K = 8
 ITERATIONS = 2

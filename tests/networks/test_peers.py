@@ -15,7 +15,7 @@ from cfr_jax.geometry.neighbors import nearest_on_host
 from cfr_jax.networks import table
 from cfr_jax.networks.inputs import Cloud
 from cfr_jax.networks.peers import fmr, rgm
-from cfr_jax.weights.authors import from_state_dict
+from cfr_jax.weights.conversion import from_state_dict
 
 N, M, WIDTH = 60, 55, 32
 STATES = {
@@ -52,7 +52,7 @@ def cloud(points, mask=None, k=19):
 
 @functools.partial(jax.jit, static_argnums=0)
 def answer(name, params, source, target):
-    record = table.network(name)
+    record = table.named(name)
     return jnp.stack(
         [step.transform for step in record.unroll(params, source, target, record.validated)]
     )
@@ -153,7 +153,7 @@ def test_fmr_registers_without_its_decoder():
 
 
 def test_clouds_too_large_to_be_stored_in_pairs_are_refused_in_words():
-    params = jax.eval_shape(lambda: table.network("dcp").fresh(jax.random.key(0), width=WIDTH))
+    params = jax.eval_shape(lambda: table.named("dcp").fresh(jax.random.key(0), width=WIDTH))
     large = Cloud(
         *(jax.ShapeDtypeStruct((9000, c), t) for c, t in ((3, "f4"), (3, "f4"), (19, "i4")))
     )
@@ -171,7 +171,7 @@ def test_fresh_parameters_have_the_sizes_of_the_published_networks():
         ("RGM", "rgm", {}),
     ):
         made = jax.eval_shape(
-            functools.partial(table.network(name).fresh, **given), jax.random.key(0)
+            functools.partial(table.named(name).fresh, **given), jax.random.key(0)
         )
         learned = [
             leaf.size

@@ -26,7 +26,7 @@ SETTINGS = {
 def fresh(name):
     width = {} if name == "fmr" else {"width": WIDTH}
     with jax.enable_x64(False):
-        return table.network(name).fresh(jax.random.key(0), **width)
+        return table.named(name).fresh(jax.random.key(0), **width)
 
 
 def batch(kind, other=None, seed=0):
@@ -45,7 +45,7 @@ def batch(kind, other=None, seed=0):
 
 
 def total(name, params, source, target, truth):
-    goal = functools.partial(table.network(name).objective, settings=SETTINGS[name])
+    goal = functools.partial(table.named(name).objective, settings=SETTINGS[name])
     found = jax.vmap(goal, (None, 0, 0, None), axis_name=PAIRS)(params, source, target, truth)
     return jnp.mean(found.loss)
 

@@ -14,7 +14,7 @@ from cfr_jax.networks.peers import assignment, fmr
 from cfr_jax.networks.peers.batch_norm import MOMENTUM, PAIRS, BatchNorm, apply_in_training
 from cfr_jax.networks.peers.gauss_newton import jacobian, steps_of
 from cfr_jax.networks.sinkhorn.plan import log_plan
-from cfr_jax.weights.authors import from_state_dict
+from cfr_jax.weights.conversion import from_state_dict
 
 # --- batch norm ---
 

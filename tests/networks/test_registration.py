@@ -14,7 +14,7 @@ from cfr_jax.networks.cfr.iterations import bind
 from cfr_jax.networks.cfr.registration import encode, register
 from cfr_jax.networks.features import raw_features
 from cfr_jax.networks.inputs import Settings, moved_by, prepare
-from cfr_jax.weights.authors import from_state_dict
+from cfr_jax.weights.conversion import from_state_dict
 
 K = 16
 SMALL = Settings(neighbors=K)

@@ -9,7 +9,7 @@ from oracle import rpmnet as oracle
 
 from cfr_jax.networks import rpmnet
 from cfr_jax.networks.cfr.registration import Cloud
-from cfr_jax.weights.authors import from_state_dict
+from cfr_jax.weights.conversion import from_state_dict
 
 
 @pytest.mark.parametrize("optimized", [True, False])

@@ -135,7 +135,7 @@ def a_pair():
 
 def test_every_network_is_found_by_its_name_and_says_what_it_is():
     for name in table.names():
-        record = table.network(name)
+        record = table.named(name)
         assert record.name == name and record.title
         assert isinstance(record.validated, record.settings)
         assert {field.name for field in dataclasses.fields(record.settings)} >= {
@@ -145,7 +145,7 @@ def test_every_network_is_found_by_its_name_and_says_what_it_is():
 
 @pytest.mark.parametrize("name", ["cfr", "rpmnet"])
 def test_what_a_network_makes_it_recognizes_and_describes(name):
-    record = table.network(name)
+    record = table.named(name)
     made = jax.eval_shape(lambda: record.fresh(jax.random.key(0), iterations=3))
     shapes = {
         "/".join(str(part.key) for part in path): leaf.shape
@@ -161,8 +161,8 @@ def test_what_a_network_makes_it_recognizes_and_describes(name):
 
 def test_an_unknown_name_and_unknown_tensors_are_told_with_what_there_is(toy):
     with pytest.raises(ValueError, match="got 'prnet', wanted one of 'cfr', 'rpmnet', .*'toy'"):
-        table.network("prnet")
-    titles = ", ".join(table.network(name).title for name in table.names())
+        table.named("prnet")
+    titles = ", ".join(table.named(name).title for name in table.names())
     assert titles.startswith("CFR, ") and titles.endswith(", Toy")
     with pytest.raises(ValueError, match=rf"no known network \({titles}\) has .*: a, b"):
         table.recognize({"b": 1, "a": 2})

@@ -412,7 +412,7 @@ class Exported(Door):
         import jax
         import jax.numpy as jnp
 
-        from cfr_jax.runtime.seals import sealed
+        from cfr_jax.runtime.checksums import sealed
         from cfr_jax.weights import stablehlo
 
         def program(a: Any, n: Any, b: Any, m: Any) -> dict[str, Any]:
@@ -466,7 +466,7 @@ class Authors(Door):
         return self.folder / "a.npz", True
 
     def read(self, path: Path) -> Any:
-        from cfr_jax.weights.authors import convert
+        from cfr_jax.weights.conversion import convert
 
         convert(path)
 

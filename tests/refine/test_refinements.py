@@ -181,6 +181,6 @@ def test_what_is_not_there_is_refused_with_what_there_is(unchecked, wrong):
 
 @pytest.mark.parametrize("name", refine.names())
 def test_every_entry_says_what_it_is_and_has_a_function(name):
-    entry = refine.refinement(name)
+    entry = refine.named(name)
 
     assert entry.title and callable(entry.function())

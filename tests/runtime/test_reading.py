@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from cfr_jax.runtime import reading
-from cfr_jax.runtime.words import MOST, Refused, shown, tidy
+from cfr_jax.runtime.messages import MOST, Refused, shown, tidy
 
 KINDS = ("folder", "pipe", "device", "endless device", "socket", "kernel", "endless kernel")
 

@@ -11,7 +11,7 @@ from oracle import authors, cfr, clouds, pieces
 from cfr_jax.networks.cfr.iterations import unroll
 from cfr_jax.networks.inputs import Settings, prepare
 from cfr_jax.training.losses import correspondence_loss, pair_loss
-from cfr_jax.weights.authors import from_state_dict
+from cfr_jax.weights.conversion import from_state_dict
 
 SMALL = Settings(neighbors=6)
 N, M, L = 24, 28, 2

@@ -20,9 +20,9 @@ from cfr_jax.data.sources import ShapeSource
 from cfr_jax.training import devices, learner, loop, optimizers, step, validation
 from cfr_jax.training.checkpoints import Checkpoints
 from cfr_jax.training.config import Phase, TrainSection
-from cfr_jax.training.drawing import Leg
-from cfr_jax.training.drawing.device import DeviceDrawing
 from cfr_jax.training.reporting.reporter import Reporter
+from cfr_jax.training.sampling import Leg
+from cfr_jax.training.sampling.device import DeviceDrawing
 from cfr_jax.weights.files import read_weights
 
 STEPS_AT_ONCE = 4

@@ -12,17 +12,18 @@ import numpy as np
 import pytest
 
 from cfr_jax.geometry import motions
-from cfr_jax.viewer import Layer, write_layers
+from cfr_jax.viewer import CloudLayer, write_layers
 from cfr_jax.viewer.layers import color
 
 HOSTILE = "</script><img src=x onerror=alert(1)>{{layers}}"
 
 
 @pytest.fixture
-def layers() -> list[Layer]:
+def layers() -> list[CloudLayer]:
     rng = np.random.default_rng(0)
     return [
-        Layer(f"scan {k}.ply", rng.normal(size=(50 * (k + 1), 3)) + (4e6, k, 0.0)) for k in range(3)
+        CloudLayer(f"scan {k}.ply", rng.normal(size=(50 * (k + 1), 3)) + (4e6, k, 0.0))
+        for k in range(3)
     ]
 
 
@@ -56,7 +57,7 @@ def test_large_layers_are_thinned_alike(layers, tmp_path):
 
 
 def test_names_are_text_and_never_html(layers, tmp_path):
-    layers[0] = Layer(HOSTILE, layers[0].points)
+    layers[0] = CloudLayer(HOSTILE, layers[0].points)
     write_layers(tmp_path / "p.html", layers, title=HOSTILE)
     text = (tmp_path / "p.html").read_text()
     assert "<img" not in text and held(tmp_path / "p.html")["layers"][0]["name"] == HOSTILE
@@ -71,7 +72,7 @@ def test_colors_of_neighbors_are_far_apart():
 
 def test_without_a_point_there_is_no_page(tmp_path):
     with pytest.raises(ValueError, match="layers: got no points"):
-        write_layers(tmp_path / "p.html", [Layer("a", np.zeros((0, 3)))])
+        write_layers(tmp_path / "p.html", [CloudLayer("a", np.zeros((0, 3)))])
     assert not (tmp_path / "p.html").exists()
 
 

@@ -9,10 +9,9 @@ import pytest
 from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors.numpy import load_file, save_file
 
-from cfr_jax.networks import rpmnet
+from cfr_jax.networks import rpmnet, table
 from cfr_jax.networks.cfr.modules import init_params
 from cfr_jax.networks.probability import KEY, Calibration, calibration_of
-from cfr_jax.networks.table import network
 from cfr_jax.weights.files import load_params, network_of, read_weights, save_params, shipped
 
 
@@ -253,7 +252,7 @@ def test_numbers_beyond_float16_are_refused_by_name_and_nothing_is_written(fresh
 
 def test_the_largest_baseline_takes_less_than_twelve_megabytes(tmp_path):
     path = tmp_path / "dcp.safetensors"
-    save_params(path, jax.jit(network("dcp").fresh)(jax.random.key(0)), float16=True)
+    save_params(path, jax.jit(table.named("dcp").fresh)(jax.random.key(0)), float16=True)
     assert read_weights(path).network == "dcp"
     assert path.stat().st_size < 12e6
 

@@ -7,8 +7,8 @@ import sys
 import warnings
 from pathlib import Path
 
+from cfr_jax.runtime.messages import Refused
 from cfr_jax.runtime.private import make_private
-from cfr_jax.runtime.words import Refused
 
 
 def keep_compiled_programs() -> None:

@@ -22,8 +22,8 @@ _AS_THE_FILE_SAYS = "-"
 
 def files_in_words() -> str:
     """The formats that are read, a line of each sort, wrapped for a help text."""
-    bare = [form for form in formats.known() if form.holds == "surface"]
-    either = [form for form in formats.known() if form.holds == "either"]
+    bare = [form for form in formats.entries() if form.holds == "surface"]
+    either = [form for form in formats.entries() if form.holds == "either"]
     surfaces = f"{formats.in_words(bare)}, and {formats.in_words(either)} with faces: points are"
     lines = {
         "clouds": formats.in_words(formats.of_clouds()),

@@ -10,18 +10,18 @@ from cfr_jax import __version__
 from cfr_jax.multiway import pose_files
 from cfr_jax.multiway.answers import Merged
 from cfr_jax.runtime.atomic import write_atomically
-from cfr_jax.viewer import Layer
+from cfr_jax.viewer import CloudLayer
 
 FORMAT = "cfr_jax/poses/1"
 
 
-def as_layers(found: Merged) -> list[Layer]:
+def as_layers(found: Merged) -> list[CloudLayer]:
     """The points of the largest model, one layer for each scan, under its name."""
     if not found.clouds:
         return []
     model = found.clouds[0]
     return [
-        Layer(found.names[scan], model.points[model.scan == scan])
+        CloudLayer(found.names[scan], model.points[model.scan == scan])
         for scan in sorted(set(model.scan.tolist()))
     ]
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 PAGE_SUFFIXES = (".html", ".htm")
 PICTURE_SUFFIXES = (".png",)
 RECORDING_SUFFIXES = (".rrd",)
+VIEW_SUFFIXES = (*PAGE_SUFFIXES, *PICTURE_SUFFIXES, *RECORDING_SUFFIXES)
 
 
 def cloud_suffixes() -> tuple[str, ...]:

@@ -17,8 +17,8 @@ from cfr_jax.cli.shared import report
 from cfr_jax.cli.shared.transforms import is_number, matrix_of
 from cfr_jax.geometry import motions
 from cfr_jax.io import PointCloud
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import contents, parse_json
-from cfr_jax.runtime.words import Refused, shown
 from cfr_jax.viewer import Scene
 
 _LARGEST_FILE = 1 << 21  # bytes; a result has a few thousand

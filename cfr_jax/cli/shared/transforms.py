@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import contents, parse_json
-from cfr_jax.runtime.words import Refused, shown
 
 _LARGEST_FILE = 1 << 21  # bytes; a result with its transforms has a few thousand
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?:nan|inf)")

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import opened
-from cfr_jax.runtime.words import Refused, shown
 
 _LEAST_BUDGET, _BUDGET = 64 << 20, 4  # bytes that may be read, and more of them for each of a file
 _SECONDS, _BYTES_PER_SECOND = 30.0, 10e6

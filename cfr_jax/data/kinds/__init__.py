@@ -29,7 +29,7 @@ _RENAMED = {
 }
 
 
-def known() -> tuple[DataKind, ...]:
+def entries() -> tuple[DataKind, ...]:
     """All kinds of data, in the order in which recognition tries them."""
     return tuple(_KINDS)
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 from cfr_jax.data.kinds import corpus
 from cfr_jax.data.kinds.kind import DataKind
+from cfr_jax.runtime.messages import Refused
 from cfr_jax.runtime.reading import text
-from cfr_jax.runtime.words import Refused
 
 if TYPE_CHECKING:
     from cfr_jax.data.pairs import Pair

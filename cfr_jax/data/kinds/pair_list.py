@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cfr_jax.data.kinds.kind import DataKind, Listing
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import opened
 from cfr_jax.runtime.sequences import OnDemand
-from cfr_jax.runtime.words import Refused, shown
 
 if TYPE_CHECKING:
     from cfr_jax.data.pairs import Pair

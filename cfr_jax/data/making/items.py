@@ -12,8 +12,8 @@ from cfr_jax.data.making.meshes import read_mesh
 from cfr_jax.data.making.samples import Item
 from cfr_jax.io.formats import by_suffix
 from cfr_jax.io.mesh import Mesh
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import text
-from cfr_jax.runtime.words import Refused, shown
 
 _LARGEST_LIST = 1 << 24  # bytes
 

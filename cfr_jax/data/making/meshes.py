@@ -16,7 +16,7 @@ from cfr_jax.geometry import motions
 from cfr_jax.io.cloud import as_float64
 from cfr_jax.io.files import read_shape
 from cfr_jax.io.mesh import Mesh, fan_triangles
-from cfr_jax.runtime.words import shown
+from cfr_jax.runtime.messages import shown
 
 _PMD_START = struct.Struct("<4sIIII")  # magic, version, size of the rest, vertices, texture sets
 _PMD_COUNT = struct.Struct("<I")

@@ -19,9 +19,9 @@ from jaxtyping import Float
 
 from cfr_jax.data.pairs.pair import Pair, PairFile
 from cfr_jax.geometry.motions import are_rigid, check_rigid
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import opened
 from cfr_jax.runtime.sequences import OnDemand, Texts
-from cfr_jax.runtime.words import Refused, shown
 
 _BLOCK = 4096  # motions that are checked at a time
 

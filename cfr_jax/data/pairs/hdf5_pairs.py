@@ -14,7 +14,7 @@ from jaxtyping import Float
 from cfr_jax.data.hdf5 import reading as hdf5
 from cfr_jax.data.pairs.pair import Pair, PairFile
 from cfr_jax.geometry.motions import check_rigid
-from cfr_jax.runtime.words import Refused, shown
+from cfr_jax.runtime.messages import Refused, shown
 
 _OF_A_PAIR = ("source", "target", "source_normals", "target_normals", "transform", "overlap")
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.sequences import MadeOnAccess
-from cfr_jax.runtime.words import Refused, shown
 
 
 @dataclass(frozen=True, eq=False)

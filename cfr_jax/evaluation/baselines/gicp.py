@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from cfr_jax import refine
 from cfr_jax.evaluation.baselines.start import Start, initial
 from cfr_jax.io import PointCloud
-from cfr_jax.refine import refinement
 from cfr_jax.refine.surfaces import HostSurface
 
 
@@ -26,5 +26,5 @@ def register(
     """
     surfaces = HostSurface(source.points), HostSurface(target.points)
     options = {"distances": distances, "neighbors": neighbors, "iterations": iterations}
-    found = refinement("small_gicp")(*surfaces, initial(source, target, start), **options)
+    found = refine.named("small_gicp")(*surfaces, initial(source, target, start), **options)
     return np.asarray(found.transform)

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cfr_jax import refine
 from cfr_jax.data.scans import estimate_normals
 from cfr_jax.evaluation.baselines.start import Start, initial
 from cfr_jax.geometry import motions
 from cfr_jax.io import PointCloud
-from cfr_jax.refine import DEFAULT, refinement
 from cfr_jax.refine.generalized_icp import CUT
 from cfr_jax.refine.surfaces import Surface
 
@@ -53,7 +53,7 @@ def _refine(
         Surface(points, normals, jnp.ones(len(points), bool))
         for points, normals in ((source, source_normals), (target, target_normals))
     )
-    return jnp.asarray(refinement(DEFAULT)(moving, fixed, jnp.eye(4)).transform)
+    return jnp.asarray(refine.named(refine.DEFAULT)(moving, fixed, jnp.eye(4)).transform)
 
 
 def _normals(cloud: PointCloud, radius: float) -> Float[np.ndarray, "n 3"]:

@@ -77,7 +77,7 @@ def recall_over_error(
     figure = new_figure(11, 4.2)
     panels = ("err_r", angle), ("err_t", distance)
     for axes, (name, most) in zip(figure.subplots(1, 2), panels, strict=True):
-        bounds, label = np.linspace(0, most, 200), metrics.metric(name).axis_label(unit)
+        bounds, label = np.linspace(0, most, 200), metrics.named(name).axis_label(unit)
         for style, m in _styled(measured):
             errors = np.sort(np.nan_to_num(m.errors[name][:, -1], nan=np.inf))
             axes.plot(bounds, np.searchsorted(errors, bounds) / len(errors), **style)
@@ -115,7 +115,7 @@ def by_iteration(path: Path, measured: Sequence[Measured], unit: str) -> None:
     """
     if all(m.err_r.shape[1] == 1 for m in measured):
         return
-    shown = [metric for metric in metrics.table() if metric.each_iteration]
+    shown = [metric for metric in metrics.entries() if metric.each_iteration]
     figure = new_figure(1.0 + 5 * len(shown), 4.2)
     for axes, metric in zip(figure.subplots(1, len(shown)), shown, strict=True):
         label = metric.axis_label(unit)

@@ -149,7 +149,9 @@ def _columns(
     measured: Sequence[Measured], thresholds: Sequence[Sequence[float]], unit: str
 ) -> list[Summary]:
     """The columns: summaries of every metric that was measured, and the recalls."""
-    known = [metric for metric in metrics.table() if any(metric.name in m.errors for m in measured)]
+    known = [
+        metric for metric in metrics.entries() if any(metric.name in m.errors for m in measured)
+    ]
     summaries = [summary for metric in known for summary in metric.summaries if summary.title]
     return summaries + [metrics.recall(angle, distance, unit) for angle, distance in thresholds]
 

@@ -89,38 +89,19 @@ def by_open3d(files: Sequence[Path], *, ordered: bool, seed: int) -> Placed:
     for source, target in itertools.combinations(range(len(clouds)), 2):
         if ordered and target > source + 2:
             continue
-        start = np.eye(4)
+        pair = clouds[source], clouds[target]
+        motion = np.eye(4)
         if not ordered:
-            start = reg.registration_ransac_based_on_feature_matching(
-                clouds[source],
-                clouds[target],
-                features[source],
-                features[target],
-                True,
-                reach,
-                reg.TransformationEstimationPointToPoint(False),
-                3,
-                [
-                    reg.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-                    reg.CorrespondenceCheckerBasedOnDistance(reach),
-                ],
-                reg.RANSACConvergenceCriteria(_TRIES, 0.999),
-            ).transformation
+            motion = _by_features(reg, *pair, features[source], features[target], reach)
         for distance in (5 * reach, reach):
-            start = reg.registration_icp(
-                clouds[source],
-                clouds[target],
-                distance,
-                start,
-                reg.TransformationEstimationPointToPlane(),
+            motion = reg.registration_icp(
+                *pair, distance, motion, reg.TransformationEstimationPointToPlane()
             ).transformation
-        information = reg.get_information_matrix_from_point_clouds(
-            clouds[source], clouds[target], reach, start
-        )
+        information = reg.get_information_matrix_from_point_clouds(*pair, reach, motion)
         if target == source + 1:
-            odometry = start @ odometry
+            odometry = motion @ odometry
             graph.nodes.append(reg.PoseGraphNode(np.linalg.inv(odometry)))
-        edge = reg.PoseGraphEdge(source, target, start, information, target != source + 1)
+        edge = reg.PoseGraphEdge(source, target, motion, information, target != source + 1)
         graph.edges.append(edge)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         reg.global_optimization(
@@ -137,3 +118,24 @@ def by_open3d(files: Sequence[Path], *, ordered: bool, seed: int) -> Placed:
         for edge in graph.edges
     ]
     return Placed(np.arange(len(poses)), poses, tuple(edges))
+
+
+def _by_features(
+    reg: Any, source: Any, target: Any, source_features: Any, target_features: Any, reach: float
+) -> Float[np.ndarray, "4 4"]:
+    """The motion that Open3D's RANSAC finds from features."""
+    return reg.registration_ransac_based_on_feature_matching(
+        source,
+        target,
+        source_features,
+        target_features,
+        True,
+        reach,
+        reg.TransformationEstimationPointToPoint(False),
+        3,
+        [
+            reg.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+            reg.CorrespondenceCheckerBasedOnDistance(reach),
+        ],
+        reg.RANSACConvergenceCriteria(_TRIES, 0.999),
+    ).transformation

@@ -131,7 +131,7 @@ _FORMATS: list[Format] = [
 ]
 
 
-def known() -> tuple[Format, ...]:
+def entries() -> tuple[Format, ...]:
     """All formats, in the order in which they are listed."""
     return tuple(_FORMATS)
 

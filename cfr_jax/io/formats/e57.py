@@ -54,7 +54,7 @@ def parse(
             raise CloudFileError(f"cannot be read as E57: {text:.200}") from None
     names = [key for key in scans[0] if all(key in scan for scan in scans)]
     values = [np.concatenate([scan[key] for scan in scans]) for key in names]
-    table = table_of(names, values, source="E57")
+    table = table_of(names, values, format="E57")
     return cloud_of_filled(table.points(), None, name, (), table if whole else None)
 
 

@@ -16,7 +16,9 @@ from cfr_jax.networks.annealing import AUTHORS_LAYERS
 from cfr_jax.networks.cfr.iterations import bind, heavy_features, iterations_of, unroll
 from cfr_jax.networks.cfr.modules import init_params
 from cfr_jax.networks.inputs import Cloud, Settings
-from cfr_jax.networks.parts import (
+from cfr_jax.networks.probability import uncalibrated
+from cfr_jax.networks.record import Checkpoint, Network, Params, Part, Place, places_of
+from cfr_jax.networks.timed_parts import (
     ANNEALING,
     FEATURES,
     MATCHING,
@@ -26,8 +28,6 @@ from cfr_jax.networks.parts import (
     move,
     on_host,
 )
-from cfr_jax.networks.probability import uncalibrated
-from cfr_jax.networks.record import Checkpoint, Network, Params, Part, Place, places_of
 
 # Tracing takes a time that grows with them, and files may claim any number.
 MOST_ITERATIONS = 100

@@ -30,7 +30,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from cfr_jax.networks.extraction.backward import backward
-from cfr_jax.networks.extraction.forward import Kept, forward
+from cfr_jax.networks.extraction.forward import Intermediates, forward
 from cfr_jax.networks.extraction.mixed import pooled_mixed
 from cfr_jax.networks.extraction.tiles import ACCELERATOR, CPU, Limits, kept_of, tiling_of
 from cfr_jax.networks.layers import Layer
@@ -82,7 +82,7 @@ def _pooled(
 
 def _pooled_fwd(
     layers: _Layers, raw: Array, valid: Array, groups: int, limits: tuple[Limits, ...]
-) -> tuple[Array, tuple[_Layers, Array, Array, Kept]]:
+) -> tuple[Array, tuple[_Layers, Array, Array, Intermediates]]:
     n, k, _ = raw.shape
     # the same number of rows on every platform: until it is lowered, this is one program
     tiling = tiling_of(n, k, limits[0])
@@ -96,7 +96,7 @@ def _pooled_fwd(
 def _pooled_bwd(
     groups: int,
     limits: tuple[Limits, ...],
-    residuals: tuple[_Layers, Array, Array, Kept],
+    residuals: tuple[_Layers, Array, Array, Intermediates],
     gradient: Array,
 ) -> tuple[_Layers, Array, Array]:
     ways = (functools.partial(backward, groups=groups, limits=one) for one in limits)

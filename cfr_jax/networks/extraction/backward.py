@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from cfr_jax.networks.extraction.forward import Kept
+from cfr_jax.networks.extraction.forward import Intermediates
 from cfr_jax.networks.extraction.tiles import Limits, cut, cut_rows, scan, tiling_of
 from cfr_jax.networks.layers import Layer, fold, projections
 
@@ -18,7 +18,7 @@ def backward(
     layers: tuple[Layer, Layer, Layer],
     raw: Float[Array, "n k c"],
     valid: Float[Array, " n"],
-    kept: Kept,
+    kept: Intermediates,
     gradient: Float[Array, "n d"],
     *,
     groups: int,

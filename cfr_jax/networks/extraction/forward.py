@@ -16,7 +16,7 @@ from cfr_jax.networks.layers import Layer, Norm, fold, norm_of
 _HIGHEST = lax.Precision.HIGHEST  # for products that become variances
 
 
-class Kept(NamedTuple):
+class Intermediates(NamedTuple):
     """What the forward pass keeps for the gradient."""
 
     norms: tuple[Norm, Norm, Norm]
@@ -34,7 +34,7 @@ def forward(
     groups: int,
     limits: Limits,
     rows_kept: int,
-) -> tuple[Float[Array, "n d"], Kept]:
+) -> tuple[Float[Array, "n d"], Intermediates]:
     """The pooled features, and what the gradient needs, including `rows_kept` rows of the second
     layer's output. Everything is finite, even if no point is valid."""
     n = raw.shape[0]
@@ -42,17 +42,19 @@ def forward(
 
     at_once = limits.at_once > 1 and tiling_of(n, raw.shape[1], limits).number == 1
 
-    def of_points() -> tuple[Array, Kept]:
+    def of_points() -> tuple[Array, Intermediates]:
         run = _of_whole if at_once else _of_tiles
         pooled, kept = run(layers, raw, valid, groups, limits)
         second = kept.second.reshape(-1, widths[1])[:rows_kept]
         more = rows_kept - len(second)  # the tiles of another platform may hold more padding
         return pooled, kept._replace(second=jnp.pad(second, ((0, more), (0, 0))))
 
-    def of_none() -> tuple[Array, Kept]:
+    def of_none() -> tuple[Array, Intermediates]:
         one, two, three = (Norm(*2 * (jnp.zeros(width, raw.dtype),)) for width in widths)
         pooled = jnp.zeros((n, widths[-1]), raw.dtype)
-        return pooled, Kept((one, two, three), pooled, jnp.zeros((rows_kept, widths[1]), raw.dtype))
+        return pooled, Intermediates(
+            (one, two, three), pooled, jnp.zeros((rows_kept, widths[1]), raw.dtype)
+        )
 
     if limits.at_once > 1:
         return of_points()  # an accelerator would have to ask the host which branch to take
@@ -66,14 +68,14 @@ def forward(
 
 def _of_whole(
     layers: tuple[Layer, Layer, Layer], raw: Array, valid: Array, groups: int, _: Limits
-) -> tuple[Array, Kept]:
+) -> tuple[Array, Intermediates]:
     pooled, values = whole.forward(layers, raw, valid, groups=groups, stored=raw.dtype)
-    return pooled, Kept(values.norms, values.normal, values.z_two)
+    return pooled, Intermediates(values.norms, values.normal, values.z_two)
 
 
 def _of_tiles(
     layers: tuple[Layer, Layer, Layer], raw: Array, valid: Array, groups: int, limits: Limits
-) -> tuple[Array, Kept]:
+) -> tuple[Array, Intermediates]:
     one, two, three = layers
     n, k, _ = raw.shape
     rows = jnp.maximum(jnp.sum(valid) * k, 1)
@@ -114,7 +116,7 @@ def _of_tiles(
     extreme = high.reshape(-1, high.shape[-1])[:n] * sign + three.bias
     normal = (extreme - norm_three.mean) * norm_three.rate
     pooled = jax.nn.relu(normal * three.scale + three.shift)
-    return pooled, Kept((norm_one, norm_two, norm_three), normal, kept)
+    return pooled, Intermediates((norm_one, norm_two, norm_three), normal, kept)
 
 
 def _sums_of_neighbors(z: Array, k: int) -> tuple[Array, Array]:

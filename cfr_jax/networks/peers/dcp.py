@@ -19,7 +19,6 @@ from jaxtyping import Array, Float
 
 from cfr_jax.geometry import rigid
 from cfr_jax.networks.inputs import Cloud
-from cfr_jax.networks.parts import FEATURES, MATCHING, MOTION, NEIGHBORS, move, on_host
 from cfr_jax.networks.peers.batch_norm import apply_in_training
 from cfr_jax.networks.peers.edges import EdgeFeatures, places_of_edges
 from cfr_jax.networks.peers.transformer import (
@@ -29,6 +28,7 @@ from cfr_jax.networks.peers.transformer import (
 )
 from cfr_jax.networks.record import Checkpoint, Goal, Network, Params, Part, Place, Step
 from cfr_jax.networks.sinkhorn import Affinity, Match
+from cfr_jax.networks.timed_parts import FEATURES, MATCHING, MOTION, NEIGHBORS, move, on_host
 
 WIDTH = 512
 ATTENTION = "attention"  # as figures call this part

@@ -21,11 +21,11 @@ from cfr_jax.geometry import rigid
 from cfr_jax.geometry.closest import closest
 from cfr_jax.networks.inputs import Cloud
 from cfr_jax.networks.layers import kernel_init
-from cfr_jax.networks.parts import FEATURES, MOTION
 from cfr_jax.networks.peers.batch_norm import NormedLinear, apply_in_training, places_of_layer
 from cfr_jax.networks.peers.gauss_newton import jacobian, steps_of
 from cfr_jax.networks.peers.maximum import highest
 from cfr_jax.networks.record import Checkpoint, Goal, Motion, Network, Params, Part, Place
+from cfr_jax.networks.timed_parts import FEATURES, MOTION
 
 _ENCODER = (64, 64, 64, 128, 1024)
 _DECODER = (1024, 512, 256)

@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cfr_jax.networks.inputs import Cloud
-from cfr_jax.networks.parts import FEATURES, MATCHING, NEIGHBORS, on_host
 from cfr_jax.networks.peers import assignment
 from cfr_jax.networks.peers.batch_norm import apply_in_training
 from cfr_jax.networks.peers.dcp import check_width
@@ -28,6 +27,7 @@ from cfr_jax.networks.peers.edges import EdgeFeatures, places_of_edges
 from cfr_jax.networks.peers.graphs import GraphLayer, places_of_graphs
 from cfr_jax.networks.peers.transformer import check_sizes
 from cfr_jax.networks.record import Checkpoint, Goal, Motion, Network, Params, Part, Place
+from cfr_jax.networks.timed_parts import FEATURES, MATCHING, NEIGHBORS, on_host
 
 WIDTH = 512
 _INLIER = 0.5  # least sum of a row or a column that is assigned

@@ -52,9 +52,9 @@ def table_of_array(
     if array.dtype.names:
         rows_of_all = array.reshape(-1)
         names = list(array.dtype.names)
-        return table_of(names, [rows_of_all[name] for name in names], columns, source="NPY"), ()
+        return table_of(names, [rows_of_all[name] for name in names], columns, format="NPY"), ()
     flat = array.reshape(-1, array.shape[-1])
-    return unnamed_table([flat[:, k] for k in range(flat.shape[1])], columns, source="NPY")
+    return unnamed_table([flat[:, k] for k in range(flat.shape[1])], columns, format="NPY")
 
 
 def read_array(data: bytes) -> np.ndarray:

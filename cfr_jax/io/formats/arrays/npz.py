@@ -97,7 +97,7 @@ def _table(arrays: _Arrays, columns: tuple[str, ...] | None) -> tuple[Table, tup
         if any(v.ndim != 1 or v.shape != values[0].shape for v in values):
             raise CloudFileError(f"arrays {', '.join(chosen)}: wanted one axis of equal length")
         inner = Roles((0, 1, 2), (3, 4, 5) if roles.normals else ())
-        return Table(tuple(chosen), tuple(values), inner, source="NPZ"), ()
+        return Table(tuple(chosen), tuple(values), inner, format="NPZ"), ()
     if len(found) != 1 and len(names) != 1:
         held = ", ".join(map(repr, sorted(names)[:8])) or "nothing"
         raise CloudFileError(
@@ -112,7 +112,7 @@ def _table(arrays: _Arrays, columns: tuple[str, ...] | None) -> tuple[Table, tup
         normals = arrays[beside[0]]
         normals = normals.reshape(-1, normals.shape[-1])
         if flat.shape[1] == 3 and normals.shape == flat.shape:
-            table = Table((key, beside[0]), (flat, normals), Roles((0,), (1,)), source="NPZ")
+            table = Table((key, beside[0]), (flat, normals), Roles((0,), (1,)), format="NPZ")
             return table, ()
         raise CloudFileError(
             f"{key!r} is {array.shape} and {beside[0]!r} {normals.shape}, wanted (n, 3) of both"
@@ -120,7 +120,7 @@ def _table(arrays: _Arrays, columns: tuple[str, ...] | None) -> tuple[Table, tup
     table, notes = table_of_array(array, columns, arrays.size, arrays.taken)
     if not array.dtype.names and array.shape[-1] == 3:
         flat = array.reshape(-1, 3)
-        return Table((key,), (flat,), Roles((0,)), source="NPZ"), notes
+        return Table((key,), (flat,), Roles((0,)), format="NPZ"), notes
     return table, notes
 
 

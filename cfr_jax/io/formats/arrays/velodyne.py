@@ -36,7 +36,7 @@ def parse(
     if len(data) % (4 * width):
         raise CloudFileError(f"has {len(data)} bytes, wanted rows of {4 * width} ({width} float32)")
     rows = np.frombuffer(data, "<f4").reshape(-1, width)
-    table = table_of(names, [rows[:, k] for k in range(width)], source="Velodyne")
+    table = table_of(names, [rows[:, k] for k in range(width)], format="Velodyne")
     return table.shape(name, (), whole)
 
 

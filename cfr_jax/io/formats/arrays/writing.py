@@ -20,7 +20,7 @@ def save_npy(stream: BinaryIO, cloud: PointCloud) -> list[str]:
 
 def _as_array(table: Table) -> np.ndarray:
     kinds = {values.dtype for values in table.values}
-    fields_before = table.named and table.source == "NPY"
+    fields_before = table.named and table.format == "NPY"
     if len(kinds) == 1 and not fields_before and (table.is_bare or not table.named):
         if all(values.ndim == 1 for values in table.values):
             return np.stack(table.values, axis=1)
@@ -38,7 +38,7 @@ def _as_array(table: Table) -> np.ndarray:
 def save_npz(stream: BinaryIO, cloud: PointCloud) -> list[str]:
     """The arrays `points` and, if there are any, `normals`, and one for every other column."""
     table, notes = without_faces(cloud, "NPZ")
-    if table.source == "NPZ":
+    if table.format == "NPZ":
         arrays = dict(zip(table.names, table.values, strict=True)) | dict(table.rest or {})
         np.savez(stream, **arrays)  # type: ignore[arg-type]  # no key is called allow_pickle
         return notes
@@ -60,7 +60,7 @@ def _stacked(table: Table, columns: tuple[int, ...]) -> np.ndarray:
 
 
 def _lost(table: Table, form: str) -> list[str]:
-    rest = table.rest if table.source == "NPZ" and form == "NPY" else None
+    rest = table.rest if table.format == "NPZ" and form == "NPY" else None
     return [f"left out the arrays {', '.join(rest)}: {form} holds one"] if rest else []
 
 

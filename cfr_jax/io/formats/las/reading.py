@@ -79,7 +79,7 @@ def parse(
         return cloud_of_filled(points, None, name)
     described = _record(data, header_size, start, records, _EXTRA_BYTES) or b""
     names, values = properties(rows, layout, described)
-    table = table_of(["x", "y", "z", *names], [*points.T, *values], source="LAS")
+    table = table_of(["x", "y", "z", *names], [*points.T, *values], format="LAS")
     return cloud_of_filled(points, None, name, (), table)
 
 

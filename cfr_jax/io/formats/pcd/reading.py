@@ -17,7 +17,7 @@ from cfr_jax.io.formats.text.lines import Text, clean_text
 from cfr_jax.io.mesh import Mesh
 from cfr_jax.io.table import Table, table_of
 
-SOURCE = "PCD"
+FORMAT = "PCD"
 PADDING = "_"
 _LARGEST_RATIO = 88  # of LZF: three bytes repeat at most 264
 
@@ -56,7 +56,7 @@ def _table(
             [values[k] for k in kept],
             columns,
             rest=header if whole else None,
-            source=SOURCE,
+            format=FORMAT,
         )
     except ValueError as error:
         raise CloudFileError(f"FIELDS: {error}") from None

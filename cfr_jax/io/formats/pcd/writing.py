@@ -7,7 +7,7 @@ from typing import BinaryIO
 import numpy as np
 
 from cfr_jax.io.cloud import CloudFileError, PointCloud
-from cfr_jax.io.formats.pcd.reading import SOURCE
+from cfr_jax.io.formats.pcd.reading import FORMAT
 from cfr_jax.io.table import Table, deforms, rounding, without_faces
 
 _TYPES = {"f": "F", "i": "I", "u": "U"}
@@ -23,7 +23,7 @@ def save(stream: BinaryIO, cloud: PointCloud) -> list[str]:
     word: so only what was double in a PCD before stays so. Raises CloudFileError for a cloud that
     float32 would deform.
     """
-    table, notes = without_faces(cloud, SOURCE)
+    table, notes = without_faces(cloud, FORMAT)
     fields: list[tuple[str, np.ndarray]] = []
     lost = []
     for k, (name, values) in enumerate(zip(table.names, table.values, strict=True)):
@@ -48,18 +48,18 @@ def _axes(
     table: Table, roles: tuple[int, ...], k: int, usual: object, values: np.ndarray
 ) -> list[tuple[str, np.ndarray]]:
     """The coordinates of a column, under the names that PCD has for them."""
-    if table.source != SOURCE:
+    if table.format != FORMAT:
         values = values.astype(np.float32)
     if len(roles) == 1:
         return [(usual[axis], values[:, axis]) for axis in range(3)]  # type: ignore[index]
     axis = roles.index(k)
-    name = table.names[k] if table.source == SOURCE else usual[axis]  # type: ignore[index]
+    name = table.names[k] if table.format == FORMAT else usual[axis]  # type: ignore[index]
     return [(name, values)]
 
 
 def _check_rounding(cloud: PointCloud, table: Table) -> None:
     single = np.dtype(np.float32)
-    if table.source == SOURCE or not deforms(cloud.points, single):
+    if table.format == FORMAT or not deforms(cloud.points, single):
         return
     extent = float(np.linalg.norm(np.ptp(cloud.points, axis=0)))
     moved = rounding(cloud.points, single) * extent
@@ -73,7 +73,7 @@ def _write(stream: BinaryIO, fields: list[tuple[str, np.ndarray]], table: Table)
     count = len(fields[0][1])
     repeats = [1 if values.ndim == 1 else values.shape[1] for _, values in fields]
     width, height, viewpoint = str(count), "1", ["0", "0", "0", "1", "0", "0", "0"]
-    if table.source == SOURCE and table.rest is not None:
+    if table.format == FORMAT and table.rest is not None:
         entries = table.rest.entries
         grid = entries.get("WIDTH", [""])[0], entries.get("HEIGHT", ["1"])[0]
         if all(n.isdecimal() for n in grid) and int(grid[0]) * int(grid[1]) == count:

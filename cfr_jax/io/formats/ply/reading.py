@@ -23,7 +23,7 @@ from cfr_jax.io.formats.text.lines import clean_text
 from cfr_jax.io.mesh import Mesh, Polygons, triangles_within
 from cfr_jax.io.table import table_of
 
-SOURCE = "PLY"
+FORMAT = "PLY"
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 16
 _FACES = re.compile(rb"element\s+(?:face|tristrips)\s+(\d+)", re.IGNORECASE)
@@ -64,7 +64,7 @@ def parse(
             columns,
             polygons=polygons,
             rest=(elements, held, vertex) if whole else None,
-            source=SOURCE,
+            format=FORMAT,
         )
     except ValueError as error:
         raise CloudFileError(f"element 'vertex' {error}") from None

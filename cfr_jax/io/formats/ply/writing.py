@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 
 from cfr_jax.io.cloud import PointCloud
 from cfr_jax.io.formats.ply.elements import Element, Ragged
-from cfr_jax.io.formats.ply.reading import SOURCE
+from cfr_jax.io.formats.ply.reading import FORMAT
 from cfr_jax.io.table import Table, plain_table
 
 _NAMES = {
@@ -32,7 +32,7 @@ def save(stream: BinaryIO, cloud: PointCloud) -> list[str]:
         _write(stream, [("vertex", list(zip(names, table.values, strict=True)))])
         return notes
     vertices = _vertices(table, notes)
-    if table.source == SOURCE and table.rest is not None:
+    if table.format == FORMAT and table.rest is not None:
         _write(stream, _again(table, vertices))
         return notes
     elements = [("vertex", vertices)]
@@ -72,9 +72,9 @@ def _vertices(table: Table, notes: list[str]) -> list[Column]:
             parts = [("n" + axis, values[:, i]) for i, axis in enumerate("xyz")]
         elif values.ndim > 1:
             parts = [(f"{name}_{i}", values[:, i]) for i in range(values.shape[1])]
-        elif table.source != SOURCE and k in table.roles.points:
+        elif table.format != FORMAT and k in table.roles.points:
             parts = [("xyz"[table.roles.points.index(k)], values)]
-        elif table.source != SOURCE and k in table.roles.normals:
+        elif table.format != FORMAT and k in table.roles.normals:
             parts = [("n" + "xyz"[table.roles.normals.index(k)], values)]
         else:
             parts = [("_".join(name.split()) or f"column_{k + 1}", values)]

@@ -69,7 +69,7 @@ def parse_ptx(
     names = _NAMES.get(rows.shape[1])
     if names is None:
         raise CloudFileError(f"has rows of {rows.shape[1]} numbers, wanted 3, 4, 6 or 7")
-    return table_of(names, list(rows.T), source="PTX").shape(name, (), whole)
+    return table_of(names, list(rows.T), format="PTX").shape(name, (), whole)
 
 
 def _scan(

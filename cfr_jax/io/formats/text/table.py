@@ -13,7 +13,7 @@ from cfr_jax.io.naming import Roles, renamed, roles_of
 from cfr_jax.io.table import Table, unnamed_table
 from cfr_jax.io.unnamed import roles_of_unnamed
 
-SOURCE = "text"
+FORMAT = "text"
 _XYZN = ("x", "y", "z", "nx", "ny", "nz")
 _XYZRGB = ("x", "y", "z", "r", "g", "b")
 
@@ -98,10 +98,10 @@ def _whole(
     if names is not None:
         roles = roles_of(names)
         _check_numbers([values[k] for k in (*roles.points, *roles.normals)])
-        return Table(names, tuple(values), roles, named, source=SOURCE), ()
+        return Table(names, tuple(values), roles, named, format=FORMAT), ()
     values = values[layout.skipped :]
     _check_numbers(values[:6])
-    return unnamed_table(values, source=SOURCE)
+    return unnamed_table(values, format=FORMAT)
 
 
 def _check_numbers(columns: list) -> None:

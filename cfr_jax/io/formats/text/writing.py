@@ -24,7 +24,7 @@ def save(stream: BinaryIO, cloud: PointCloud) -> list[str]:
         if spaced:
             notes.append(f"left out {', '.join(spaced)}: text with blanks, which .csv can hold")
             flat = [(name, values) for name, values in flat if name not in spaced]
-    if table.named and not (table.is_bare and table.source != "text"):
+    if table.named and not (table.is_bare and table.format != "text"):
         names = [name.replace(" ", "_") for name, _ in flat]
         stream.write(("# " + " ".join(names) + "\n").encode())
     _write_rows(stream, [values for _, values in flat], " ")

@@ -12,7 +12,7 @@ from safetensors.numpy import save_file
 
 from cfr_jax.cli import main
 from cfr_jax.networks import table
-from cfr_jax.weights.authors import convert, from_state_dict
+from cfr_jax.weights.conversion import convert, from_state_dict
 from cfr_jax.weights.files import network_of, read_weights
 
 # What random state dict, of how many tensors; which network, and how it is made anew.
@@ -35,9 +35,7 @@ def test_every_number_of_a_published_checkpoint_finds_its_place(title):
 
     assert len(state) == count
     assert network_of(params) == name
-    wanted = jax.eval_shape(
-        functools.partial(table.network(name).fresh, **given), jax.random.key(0)
-    )
+    wanted = jax.eval_shape(functools.partial(table.named(name).fresh, **given), jax.random.key(0))
     assert jax.tree.structure(params) == jax.tree.structure(wanted)
     assert jax.tree.map(np.shape, params) == jax.tree.map(np.shape, wanted)
     theirs = [value.ravel() for name, value in state.items() if not name.endswith(NEEDLESS)]

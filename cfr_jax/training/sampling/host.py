@@ -11,8 +11,8 @@ from cfr_jax.data.loader import batches
 from cfr_jax.data.mixture import Mixture
 from cfr_jax.training import devices, step
 from cfr_jax.training.config import TrainingConfig
-from cfr_jax.training.drawing import Leg, Stretch
 from cfr_jax.training.losses import PairLoss
+from cfr_jax.training.sampling import Leg, Stretch
 from cfr_jax.training.step import TrainState
 
 

@@ -25,8 +25,8 @@ from safetensors.numpy import load
 
 from cfr_jax.networks import table
 from cfr_jax.networks.record import Checkpoint, Network, Params
+from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import contents
-from cfr_jax.runtime.words import Refused, shown
 
 # Bytes that tensors may take: so many, and for each byte of their file so many more.
 _LEAST_BUDGET, _BUDGET = 64 << 20, 4
@@ -124,7 +124,7 @@ def _some(faults: list[str]) -> str:
 def _recognized(names: Collection[str], where: str) -> tuple[Network, Checkpoint]:
     """The network whose authors' checkpoints have tensors with these names."""
     titles = []
-    for record in map(table.network, table.names()):
+    for record in map(table.named, table.names()):
         if record.checkpoint is None:
             continue
         if record.checkpoint.recognizes(names):

@@ -53,9 +53,9 @@ def make_drawing(config: TrainingConfig, mixture: Mixture, mesh: Mesh) -> Drawin
     """The drawing that `config.train.draw` names, "host" or "device"."""
     # imported here because both modules import this one
     if config.train.draw == "device":
-        from cfr_jax.training.drawing.device import DeviceDrawing
+        from cfr_jax.training.sampling.device import DeviceDrawing
 
         return DeviceDrawing(config, mixture, mesh)
-    from cfr_jax.training.drawing.host import HostDrawing
+    from cfr_jax.training.sampling.host import HostDrawing
 
     return HostDrawing(config, mixture, mesh)

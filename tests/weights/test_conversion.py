@@ -10,7 +10,7 @@ from oracle import authors
 from safetensors.numpy import save_file
 
 from cfr_jax.networks.cfr.modules import init_params
-from cfr_jax.weights.authors import convert, from_state_dict
+from cfr_jax.weights.conversion import convert, from_state_dict
 from cfr_jax.weights.files import network_of
 
 
