@@ -78,7 +78,7 @@ def fit_rigid(
     return from_parts(rotation, center_target * size_target - turned)
 
 
-def _largest(values: Float[Array, "..."]) -> Float[Array, ""]:
+def _largest(values: Float[Array, "*shape"]) -> Float[Array, ""]:
     """The largest absolute value, or one if all are zero; a constant to derivatives."""
     largest = jnp.max(jnp.abs(values), initial=0)
     return lax.stop_gradient(jnp.where(largest > 0, largest, 1))
