@@ -1,4 +1,4 @@
-"""Measures one machine in one call: python benchmarks/accelerator.py [--minutes 5]
+r"""Measures one machine in one call: python benchmarks/accelerator.py [--minutes 5]
 
 It measures the limits of arithmetic and memory, `register` at several sizes and batches, `align`
 and its parts, the last refinement on the host, a training step with the drawing of its pairs,
@@ -6,6 +6,12 @@ kernels per call and compile seconds, and checks that the results agree with the
 accelerator.json and a Markdown table, with the device and versions. With `--authors CHECKOUT` the
 authors' PyTorch programs run on the same clouds and device. Everything also runs on a CPU. The most
 important lines are measured first; lines that no longer fit into the time are listed.
+
+For a machine that is lent for a few minutes: everything in one call of less than six minutes, with
+all results in one archive:
+
+    mkdir -p out && timeout 350 python benchmarks/accelerator.py --minutes 4.8 --steps 10 \
+        --out out/accelerator.json > out/log.txt 2>&1; tar czf accelerator.tgz out
 """
 
 from __future__ import annotations
@@ -47,6 +53,7 @@ EACH = 30.0  # seconds that a line may need, mostly for compiling
 def main() -> None:
     """Measures line by line and writes the results."""
     args = _arguments()
+    args.out.parent.mkdir(parents=True, exist_ok=True)
     clock = Clock(60 * args.minutes)
     found = {
         "machine": machine.describe(),
@@ -323,7 +330,10 @@ def as_table(found: dict) -> str:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=5.0, help="start no line after this time")
-    parser.add_argument("--out", type=Path, default=HERE / "results" / "accelerator.json")
+    parser.add_argument(
+        "--out", type=Path, default=HERE / "results" / "accelerator.json",
+        help="the JSON file, written after every line; the table goes beside it, as .md",
+    )  # fmt: skip
     parser.add_argument(
         "--training", type=int, nargs="*", default=[64], metavar="BATCH",
         help="batch sizes of the training steps; give none to skip them",
