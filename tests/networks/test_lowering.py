@@ -1,6 +1,7 @@
 """The same functions lower for GPUs and TPUs, here, without either: no program that only a CPU has,
 and full precision wherever geometry is computed."""
 
+import functools
 import re
 
 import jax
@@ -10,10 +11,12 @@ import pytest
 from cfr_jax.alignment.solving import DeviceCloud, solve_pair
 from cfr_jax.geometry import rigid
 from cfr_jax.geometry.eigen import least_direction
-from cfr_jax.networks import rpmnet
+from cfr_jax.networks import rpmnet, table
 from cfr_jax.networks.cfr.modules import CHANNELS, init_params
 from cfr_jax.networks.cfr.registration import Settings, encode, register
 from cfr_jax.networks.inputs import Cloud, prepare
+from cfr_jax.networks.peers import dcp, fmr, rgm
+from cfr_jax.networks.peers.batch_norm import PAIRS
 from cfr_jax.networks.sinkhorn import Form
 from cfr_jax.refine import find
 
@@ -48,6 +51,11 @@ def training(params, form: Form):
     return jax.jit(jax.grad(loss, (0, 1, 2))), (params, shape(N, 6), shape(M, 6))
 
 
+def encoding(params, y):
+    encoded = encode(params, y, settings=Settings(neighbors=K))
+    return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(encoded) if leaf.dtype == jnp.float32)
+
+
 def preparing(points):
     return jnp.sum(prepare(points, settings=Settings(neighbors=K)).normals)
 
@@ -63,6 +71,26 @@ def of_rpm_net():
     return params, *(Cloud(shape(n, 3), shape(n, 3), shape(n, K, dtype=jnp.int32)) for n in (N, M))
 
 
+PEERS = {
+    "dcp": dcp.DCPSettings(neighbors=K, training=True),
+    "fmr": fmr.FMRSettings(iterations=L, supervised=True),
+    "rgm": rgm.RGMSettings(neighbors=K, passes=L, training=True),
+}
+
+
+def training_peer(name):
+    """The gradient of the loss of two pairs."""
+    network = table.network(name)
+    params = jax.eval_shape(lambda: network.fresh(jax.random.key(0)))
+    sides = [Cloud(shape(2, n, 3), shape(2, n, 3), shape(2, n, K, dtype=jnp.int32)) for n in (N, M)]
+
+    def loss(*given):
+        goal = functools.partial(network.objective, settings=PEERS[name])
+        return jnp.mean(jax.vmap(goal, (None, 0, 0, 0), axis_name=PAIRS)(*given).loss)
+
+    return jax.jit(jax.grad(loss)), (params, *sides, shape(2, 4, 4))
+
+
 def aligning(params):
     def cloud(n):
         return DeviceCloud(shape(n, 3), shape(n, K, dtype=jnp.int32), shape(n, dtype=bool))
@@ -76,23 +104,37 @@ PROGRAMS = {
     "encode": lambda params: (jax.jit(encode), (params, shape(M, 6))),
     "gradient, dense": lambda params: training(params, "dense"),
     "gradient, streamed": lambda params: training(params, "streamed"),
+    "gradient of encode": lambda params: (
+        jax.jit(jax.grad(encoding, (0, 1))),
+        (params, shape(M, 6)),
+    ),
     "prepare": lambda params: (jax.jit(preparing), (shape(N, 3),)),
     "gradient of prepare": lambda params: (jax.jit(jax.grad(preparing)), (shape(N, 3),)),
     "RPM-Net": lambda params: (jax.jit(rpm_net), of_rpm_net()),
     "gradient of RPM-Net": lambda params: (jax.jit(jax.grad(rpm_net)), of_rpm_net()),
+    "gradient of DCP": lambda params: training_peer("dcp"),
+    "gradient of FMR": lambda params: training_peer("fmr"),
+    "gradient of RGM": lambda params: training_peer("rgm"),
     "align": aligning,
 }
 
 
-def lowered(params, name, platform):
-    program, arguments = PROGRAMS[name](params)
-    return program.trace(*arguments).lower(lowering_platforms=(platform,)).as_text()
+@pytest.fixture(scope="module")
+def lowered(params):
+    """The text of a program for a platform; each program is traced once for all platforms."""
+
+    @functools.cache
+    def traced(name):
+        program, arguments = PROGRAMS[name](params)
+        return program.trace(*arguments)
+
+    return lambda name, platform: traced(name).lower(lowering_platforms=(platform,)).as_text()
 
 
 @pytest.mark.parametrize("platform", PLATFORMS)
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_nothing_that_only_a_cpu_has_is_called(params, name, platform):
-    text = lowered(params, name, platform)
+def test_nothing_that_only_a_cpu_has_is_called(lowered, name, platform):
+    text = lowered(name, platform)
 
     called = set(re.findall(r"custom_call @([\w.$]+)", text))
     assert not {name for name in called if re.search("lapack|callback|cpu|ynn|onednn", name)}
@@ -107,12 +149,26 @@ def test_nothing_that_only_a_cpu_has_is_called(params, name, platform):
 
 
 @pytest.mark.parametrize(
+    "name",
+    ["gradient, dense", "gradient, streamed", "gradient of encode", "gradient of FMR", "align"],
+)
+def test_no_array_becomes_float64_where_a_caller_enables_it(params, name):
+    """Recent GPUs compute it slowly, and TPUs emulate it."""
+    program, arguments = PROGRAMS[name](params)
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        text = program.trace(*arguments).lower(lowering_platforms=("cuda",)).as_text()
+
+    # a number of Python is a scalar of float64 until it meets an array
+    assert not re.findall(r".*tensor<\d[\dx]*xf64>.*", text)
+
+
+@pytest.mark.parametrize(
     "name", ["register, dense", "register, streamed", "gradient, dense", "gradient, streamed"]
 )
-def test_distances_and_matches_are_computed_at_full_precision(params, name):
+def test_distances_and_matches_are_computed_at_full_precision(lowered, name):
     """On recent GPUs and on TPUs a product of float32 is rounded to ten bits or fewer, unless said
     otherwise."""
-    text = lowered(params, name, "cuda")
+    text = lowered(name, "cuda")
 
     found = 0
     for line in text.splitlines():

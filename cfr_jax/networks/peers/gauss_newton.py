@@ -62,7 +62,7 @@ def steps_of(
     unit = system * scale[:, None] * scale + jnp.diag(jnp.where(moving, 0, 1).astype(scale.dtype))
     one = jnp.eye(6, dtype=unit.dtype)
     pivots = jnp.diagonal(jnp.linalg.cholesky(lax.stop_gradient(unit))) ** 2  # NaN where it stops
-    unit = unit + jnp.where(jnp.min(pivots) > _SINGULAR, 0, _RIDGE) * one
+    unit = unit + jnp.where(jnp.min(pivots) > _SINGULAR, 0, _RIDGE * one)
     inverse = jax.vmap(solve_positive, (None, 0))(unit, one)
 
     def step(motion: Array, _: None) -> tuple[Array, Array]:
