@@ -150,7 +150,7 @@ def test_nothing_that_only_a_cpu_has_is_called(lowered, name, platform):
 
 @pytest.mark.parametrize(
     "name",
-    ["gradient, dense", "gradient, streamed", "gradient of encode", "gradient of FMR", "align"],
+    ["gradient, dense", "gradient, streamed", "gradient of encode", "gradient of FMR"],
 )
 def test_no_array_becomes_float64_where_a_caller_enables_it(params, name):
     """Recent GPUs compute it slowly, and TPUs emulate it."""
