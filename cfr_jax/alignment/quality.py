@@ -106,7 +106,10 @@ def spacing(
     """The median distance from a point to its nearest neighbor."""
     offset = points[neighbors] - points[:, None]
     nearest = jnp.sqrt(jnp.min(jnp.sum(offset * offset, axis=2), axis=1))
-    return jnp.nanmedian(jnp.where(mask, nearest, jnp.nan))
+    # not `nanmedian`, which counts in float64 if that is enabled
+    ordered = jnp.sort(jnp.where(mask, nearest, jnp.inf))
+    count = jnp.sum(mask, dtype=jnp.int32)
+    return (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
 
 
 def information_matrix(

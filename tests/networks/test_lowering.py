@@ -80,7 +80,7 @@ PEERS = {
 
 def training_peer(name):
     """The gradient of the loss of two pairs."""
-    network = table.network(name)
+    network = table.named(name)
     params = jax.eval_shape(lambda: network.fresh(jax.random.key(0)))
     sides = [Cloud(shape(2, n, 3), shape(2, n, 3), shape(2, n, K, dtype=jnp.int32)) for n in (N, M)]
 
@@ -150,7 +150,7 @@ def test_nothing_that_only_a_cpu_has_is_called(lowered, name, platform):
 
 @pytest.mark.parametrize(
     "name",
-    ["gradient, dense", "gradient, streamed", "gradient of encode", "gradient of FMR"],
+    ["gradient, dense", "gradient, streamed", "gradient of encode", "gradient of FMR", "align"],
 )
 def test_no_array_becomes_float64_where_a_caller_enables_it(params, name):
     """Recent GPUs compute it slowly, and TPUs emulate it."""
