@@ -237,7 +237,7 @@ def test_a_start_and_a_search_are_not_asked_for_together(pair, capsys, searching
     assert "not allowed with argument" in capsys.readouterr().err
 
 
-def test_pictures_show_the_way_from_the_start_to_the_answer(pair, answering):
+def test_pictures_show_the_way_from_the_file_over_the_start_to_the_answer(pair, answering):
     # given
     initial = cli_samples.motion(5.0)
     answering(initial=initial)
@@ -247,8 +247,9 @@ def test_pictures_show_the_way_from_the_start_to_the_answer(pair, answering):
     scene = report.as_scene(report.register(source, target, initial=initial), {"error": "2 m"})
 
     # then
-    assert scene.labels == ("start", "iteration 1", "iteration 2", "refined")
-    np.testing.assert_array_equal(scene.transforms[0], initial)
+    assert scene.labels == ("as given", "start", "iteration 1", "iteration 2", "refined")
+    np.testing.assert_array_equal(scene.transforms[0], np.eye(4))
+    np.testing.assert_array_equal(scene.transforms[1], initial)
     np.testing.assert_array_equal(scene.transforms[-1], cli_samples.motion())
     assert np.isnan(scene.weights[1::2]).all() and scene.weights[-2] == 1.0
     assert next(iter(scene.facts)) == "error" and "confidence" in scene.facts

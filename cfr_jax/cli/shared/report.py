@@ -147,7 +147,7 @@ def quality(found: Any) -> dict[str, str]:
 
 
 def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
-    """The motion from the start to the answer, with `facts` shown before the quality."""
+    """The motion from the file's own pose to the answer, with `facts` shown before the quality."""
     found = result.alignment
     stations, labels = way(
         result.initial, found.transforms, found.transform if found.refined else None
@@ -170,9 +170,16 @@ def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
 def way(
     initial: ArrayLike | None, transforms: Iterable[ArrayLike], refined: ArrayLike | None
 ) -> tuple[list[Any], list[str]]:
-    """The stations of the motion, each (4, 4), and their labels."""
-    stations = [np.eye(4) if initial is None else initial, *transforms]
-    labels = ["start", *(f"iteration {i}" for i in range(1, len(stations)))]
+    """The stations of the motion, each (4, 4), and their labels.
+
+    The first is where the source's file has it. The start may be far from there: a second look or a
+    search may have chosen it, and then it is nearly the answer."""
+    stations, labels = [np.eye(4)], ["start"]
+    if initial is not None:
+        stations, labels = [np.eye(4), initial], ["as given", "start"]
+    for number, transform in enumerate(transforms, start=1):
+        stations.append(transform)
+        labels.append(f"iteration {number}")
     if refined is not None:
         stations.append(refined)
         labels.append("refined")
