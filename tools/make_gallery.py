@@ -98,7 +98,9 @@ def shrink(picture: Path) -> None:
     with Image.open(picture) as image:
         height = round(image.height * _WIDTH / image.width)
         small = image.convert("RGB").resize((_WIDTH, height), Image.Resampling.LANCZOS)
-    small.quantize(_COLORS, dither=Image.Dither.NONE).save(picture, optimize=True)
+    # This method keeps colors that are rare, such as those of a small source.
+    way = Image.Quantize.MAXCOVERAGE
+    small.quantize(_COLORS, way, dither=Image.Dither.NONE).save(picture, optimize=True)
 
 
 def row(name: str, report: dict, truth: Float64[np.ndarray, "4 4"] | None) -> str:
