@@ -30,10 +30,12 @@ from cfr_jax.networks.clues import (
 from cfr_jax.networks.inputs import Cloud, Settings, check_points, prepare
 from cfr_jax.networks.probability import calibration_of
 from cfr_jax.networks.record import Params
+from cfr_jax.runtime.entries import entry
+from cfr_jax.runtime.values import ByValue
 
 
-@struct.dataclass
-class Registration:
+@struct.dataclass(eq=False)
+class Registration(ByValue):
     """The answer of `register`."""
 
     transforms: Float[Array, "L 4 4"]
@@ -62,6 +64,7 @@ class Registration:
         return self.transforms[..., -1, :, :]
 
 
+@entry
 def encode(
     params: Params,
     target: Float[Array | np.ndarray, "m c"] | Cloud,
@@ -86,6 +89,7 @@ def _encode(params: Params, target: Array | Cloud, *, settings: Settings) -> Enc
     return encoded(params, _prepared("target", target, settings), settings)
 
 
+@entry
 def register(
     params: Params,
     source: Float[Array | np.ndarray, "n c"] | Cloud,
