@@ -112,10 +112,16 @@ def register(
     that are nearly aligned. A further cascade takes as long as another registration onto an encoded
     target.
 
-    Gradients flow through everything but the choice of neighbors. Raises ValueError for wrong
-    shapes, for masked arrays with masked values, and for values that are not finite or lie so far
-    out that float32 cannot tell points apart. Inside `jit` and `vmap` the values are not known, and
-    NaN in gives NaN out. Clouds of another than unit size are not refused; the confidence falls.
+    Derivatives exist for everything but the choice of neighbors, which is held fixed: in reverse
+    mode (`jax.grad`, `jax.jacrev`), in forward mode (`jax.jacfwd`, `jax.jvp`), and of second order
+    (`jax.hessian`). Only reverse mode is written by hand to save memory; the others keep what JAX
+    keeps, and take longer to compile.
+
+    Raises ValueError for wrong shapes, for masked arrays with masked values, and for values that
+    are not finite or lie so far out that float32 cannot tell points apart. Inside `jit` and `vmap`
+    the values are not known, and NaN in gives NaN out. Clouds of another than unit size are not
+    refused; the confidence falls. Raises RuntimeError in a process that was forked after the first
+    call.
     """
     check_params(params)
     for name, count in (("iterations", iterations), ("cascades", cascades)):
