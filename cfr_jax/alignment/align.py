@@ -19,9 +19,11 @@ from cfr_jax.networks.cfr.network import check_params
 from cfr_jax.networks.probability import calibration_of
 from cfr_jax.networks.record import Params
 from cfr_jax.refine import Refine, Refinement, find
+from cfr_jax.runtime.entries import entry
 from cfr_jax.weights.files import load_params
 
 
+@entry
 def align(
     source: Any,
     target: Any,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,12 +13,13 @@ from cfr_jax.alignment import basins, confidence, doubts, measuring, quality, se
 from cfr_jax.alignment.case import Case
 from cfr_jax.geometry import motions
 from cfr_jax.networks.probability import calibration_of
+from cfr_jax.runtime.values import ByValue
 
 _REACH = 90.0  # degrees: turns by up to 45 about each of three axes stay within
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
+class Alignment(ByValue):
     """The answer of `align`. Everything is in the caller's frame and units.
 
     `fitness`, `inlier_rmse`, `overlap` and `information` are measured on all points if a refinement
@@ -76,12 +77,7 @@ class Alignment:
     """Other motions that fit about as well or better. They were found by a search or, if the answer
     would be trusted, by turning it far. If there are any, the shape is nearly symmetric."""
 
-    def __eq__(self, other: object) -> bool:
-        """Whether all fields but `seconds` are equal, bit by bit."""
-        if not isinstance(other, Alignment):
-            return NotImplemented
-        names = (each.name for each in fields(self) if each.name != "seconds")
-        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
+    _not_compared = ("seconds",)
 
     @property
     def trusted(self) -> bool:

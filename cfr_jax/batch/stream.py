@@ -19,6 +19,7 @@ from cfr_jax.geometry import units
 from cfr_jax.io import PointCloud, as_point_cloud
 from cfr_jax.networks.record import Params
 from cfr_jax.refine import Refine
+from cfr_jax.runtime.entries import entry
 
 # More pairs per call keep an accelerator busy, but do not fit in a CPU's caches.
 ON_CPU, ON_ACCELERATOR = 1, 16
@@ -38,6 +39,7 @@ class Outcome:
     """Why there is no alignment."""
 
 
+@entry
 def align_many(
     pairs: Iterable[Any],
     *,

@@ -148,7 +148,6 @@ def _turn(
     return turned, basis
 
 
-@jax.custom_jvp
 def least_direction(covariance: Float[Array, "3 3"]) -> Float[Array, " 3"]:
     """Unit eigenvector for the smallest eigenvalue of a symmetric matrix; its sign is arbitrary.
 
@@ -156,22 +155,67 @@ def least_direction(covariance: Float[Array, "3 3"]) -> Float[Array, " 3"]:
     at most 1e-5 of the matrix's largest entry (a line, a ball). The limit is relative, so it holds
     at every scale.
     """
-    values, vectors = symmetric_eigen(_unit_scale(covariance)[0])
-    return vectors[:, jnp.argmin(values)]
+    return _least_and_rest(_unit_scale(covariance)[0])[0]
 
 
-@least_direction.defjvp
-def _least_direction_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    (covariance,), (tangent,) = primals, tangents
-    scaled, scale = _unit_scale(covariance)
-    values, vectors = symmetric_eigen(scaled)
-    least = vectors[:, jnp.argmin(values)]
+@jax.custom_jvp
+def _least_and_rest(matrix: Float[Array, "3 3"]) -> tuple[Float[Array, " 3"], Float[Array, "3 3"]]:
+    """The eigenvector n for the smallest eigenvalue l, and the pseudo-inverse of matrix - l I,
+    which is all that derivatives of n of any order need."""
+    values, vectors = symmetric_eigen(matrix)
     gap = values - jnp.min(values)
-    apart = gap > 1e-5
-    change = jnp.matmul(tangent / scale, least, precision=_HIGHEST)
-    pull = jnp.matmul(vectors.T, change, precision=_HIGHEST)
-    pull = jnp.where(apart, pull / jnp.where(apart, gap, 1), 0)
-    return least, -jnp.matmul(vectors, pull, precision=_HIGHEST)
+    return vectors[:, jnp.argmin(values)], _inverse(gap, vectors)
+
+
+@_least_and_rest.defjvp
+def _least_and_rest_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple, tuple]:
+    (matrix,), (tangent,) = primals, tangents
+    least, inverse = _least_and_rest(matrix)
+    change = jnp.matmul(tangent, least, precision=_HIGHEST)
+    of_least = -jnp.matmul(inverse, change, precision=_HIGHEST)
+    # what is inverted has the null space n, and whatever else is not determined
+    identity = jnp.eye(3, dtype=matrix.dtype)
+    smallest = jnp.sum(least * jnp.matmul(matrix, least, precision=_HIGHEST))
+    inverted = matrix - smallest * identity
+    rest = identity - jnp.matmul(inverse, inverted, precision=_HIGHEST)
+    shifted = tangent - jnp.sum(least * change) * identity
+    return (least, inverse), (of_least, _change_of_inverse(inverse, rest, shifted))
+
+
+@jax.custom_jvp
+def pseudo_inverse(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """The pseudo-inverse of a symmetric positive semidefinite matrix with entries of about one.
+
+    Eigenvalues of at most 1e-5 count as zero. There are derivatives of every order; in directions
+    that do not count they are those of a matrix whose rank stays as it is.
+    """
+    return _inverse(*symmetric_eigen(matrix))
+
+
+@pseudo_inverse.defjvp
+def _pseudo_inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (matrix,), (tangent,) = primals, tangents
+    inverse = pseudo_inverse(matrix)
+    identity = jnp.eye(len(matrix), dtype=matrix.dtype)
+    rest = identity - jnp.matmul(inverse, matrix, precision=_HIGHEST)
+    return inverse, _change_of_inverse(inverse, rest, tangent)
+
+
+def _change_of_inverse(inverse: Array, rest: Array, change: Array) -> Array:
+    """The derivative of a symmetric pseudo-inverse for a `change` of its matrix (Golub & Pereyra,
+    1973); `rest` projects onto the null space."""
+
+    def product(*factors: Array) -> Array:
+        return functools.reduce(functools.partial(jnp.matmul, precision=_HIGHEST), factors)
+
+    twice = product(inverse, inverse, change, rest)
+    return twice + twice.T - product(inverse, change, inverse)
+
+
+def _inverse(values: Float[Array, " d"], vectors: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    counts = values > 1e-5
+    inverse = jnp.where(counts, 1 / jnp.where(counts, values, 1), 0)
+    return jnp.matmul(vectors * inverse, vectors.T, precision=_HIGHEST)
 
 
 def _unit_scale(matrix: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Float[Array, ""]]:

@@ -66,11 +66,15 @@ def _nearest_by_bits(
     def choose(row: Array, square: Array) -> Array:
         if mask is not None:
             square = jnp.where(mask, square, jnp.inf)
-        square = jnp.where(row == jnp.arange(n), jnp.inf, square)
+        square = jnp.where(row == jnp.arange(n, dtype=jnp.int32), jnp.inf, square)
         first = jnp.argmin(square, axis=1).astype(jnp.int32)
         chosen = k_smallest(square, k)
         far = ~(jnp.take_along_axis(square, chosen, axis=1) <= limit)
-        far |= jnp.isinf(jnp.take_along_axis(square, chosen, axis=1))
+        nowhere = jnp.isinf(jnp.take_along_axis(square, chosen, axis=1))
+        far |= nowhere
+        if k == n - 1 and mask is not None:  # points come before padding (`others`)
+            order = jnp.argsort(nowhere, axis=1, stable=True)
+            chosen, far = (jnp.take_along_axis(part, order, axis=1) for part in (chosen, far))
         return jnp.where(far, first[:, None], chosen)
 
     return _by_rows(points, choose)
@@ -111,7 +115,7 @@ def _first_by_bits(
     points: Float[Array, "n 3"], mask: Bool[Array, " n"] | None, k: int, radius: float
 ) -> Int32[Array, "n k"]:
     def choose(row: Array, square: Array) -> Array:
-        inside = (square <= radius * radius) & (row != jnp.arange(points.shape[0]))
+        inside = (square <= radius * radius) & (row != jnp.arange(points.shape[0], dtype=jnp.int32))
         if mask is not None:
             inside &= mask
         rank = jnp.arange(k, dtype=jnp.int32)[None, :]
@@ -156,6 +160,17 @@ def _by_rows(
 
     found = lax.map(block, rows * jnp.arange(blocks, dtype=jnp.int32))
     return found.reshape(blocks * rows, -1)[:n]
+
+
+def others(mask: Bool[Array, " n"] | None, k: int) -> Bool[Array, " k"] | None:
+    """Which of the k columns of neighbors are no padding; None where all are, as in most clouds.
+
+    In a cloud of k + 1 points, each valid point has all others as neighbors, and columns are left
+    if not all points are valid. They hold the nearest neighbor again.
+    """
+    if mask is None or k < len(mask) - 1:
+        return None
+    return jnp.arange(k, dtype=jnp.int32) < jnp.sum(mask, dtype=jnp.int32) - 1
 
 
 def nearest_on_host(

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
 from cfr_jax.geometry.eigen import least_direction
+from cfr_jax.geometry.neighbors import others
 
 # Neighbors are weighted by exp(-d^2 / 2 s^2), where s is this share of their root mean square
 # distance. On noisy partial clouds of 717 points, 64 neighbors weighted this way give a median
@@ -32,8 +33,16 @@ def estimate_normals(
     """
     offset = points[neighbors] - points[:, None]
     square = jnp.sum(offset * offset, axis=-1)
-    reach = _REACH**2 * jnp.mean(square, axis=1, keepdims=True)
+    k = neighbors.shape[1]
+    columns = others(mask, k)
+    if columns is None:
+        reach = _REACH**2 * jnp.mean(square, axis=1, keepdims=True)
+    else:
+        counted = columns.astype(points.dtype)[None]
+        total = jnp.sum(square * counted, axis=1, keepdims=True)
+        reach = _REACH**2 * total / jnp.maximum(jnp.sum(counted), 1)
     weight = jnp.exp(square / jnp.where(reach > 0, -2 * reach, 1))
+    weight = weight if columns is None else weight * counted
     # the point itself belongs to its neighborhood, with offset zero and weight one
     weight = weight / (1 + jnp.sum(weight, axis=1, keepdims=True))
     mean = jnp.sum(weight[..., None] * offset, axis=1)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from cfr_jax.geometry.eigen import leading_eigenvector, symmetric_eigen
+from cfr_jax.geometry.eigen import leading_eigenvector, pseudo_inverse
 
 _HIGHEST = lax.Precision.HIGHEST
 
@@ -117,15 +117,11 @@ def _nearest_rotation_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tupl
     stretch = jnp.matmul(rotation.T, matrix, precision=_HIGHEST)
     stretch = (stretch + stretch.T) / 2
     system = jnp.trace(stretch) * jnp.eye(3, dtype=matrix.dtype) - stretch
-    largest = jnp.max(jnp.abs(system))
+    largest = lax.stop_gradient(jnp.max(jnp.abs(system)))
     scale = jnp.where(largest > 0, largest, 1)
-    values, vectors = symmetric_eigen(lax.stop_gradient(system / scale))
-    determined = values > 1e-5
-    inverse = jnp.where(determined, 1 / jnp.where(determined, values, 1), 0)
     change = jnp.matmul(rotation.T, tangent / scale, precision=_HIGHEST)
-    axial = _vee(change - change.T)
-    along = inverse * jnp.matmul(vectors.T, axial, precision=_HIGHEST)
-    turn = jnp.matmul(vectors, along, precision=_HIGHEST)
+    inverse = pseudo_inverse(system / scale)
+    turn = jnp.matmul(inverse, _vee(change - change.T), precision=_HIGHEST)
     return rotation, jnp.matmul(rotation, skew(turn), precision=_HIGHEST)
 
 

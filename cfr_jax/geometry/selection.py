@@ -36,11 +36,11 @@ def k_smallest(values: Float[Array, "r n"], k: int) -> Int32[Array, "r k"]:
     low = jnp.min(bits, axis=1)
     kth, _ = lax.fori_loop(0, 31, halve, (low, jnp.max(bits, axis=1)))
     below, equal = bits < kth[:, None], bits == kth[:, None]
-    spare = k - jnp.sum(below, axis=1)
+    spare = k - jnp.sum(below, axis=1, dtype=jnp.int32)
     # among the values that tie for the k-th place, only the first `spare` columns are taken
     words_equal = pack(equal)
     last_equal = nth_set_bit(words_equal, spare[:, None] - 1)
-    taken = below | (equal & (jnp.arange(n) <= last_equal))
+    taken = below | (equal & (jnp.arange(n, dtype=jnp.int32) <= last_equal))
     return nth_set_bit(pack(taken), jnp.broadcast_to(jnp.arange(k), (values.shape[0], k)))
 
 
@@ -103,7 +103,8 @@ def pack(flags: Bool[Array, "r n"]) -> Array:
     """Packs rows of flags into rows of 32-bit words, lowest bit first."""
     rows, n = flags.shape
     padded = jnp.pad(flags, ((0, 0), (0, -n % _WORD))).reshape(rows, -1, _WORD)
-    return jnp.sum(padded.astype(jnp.uint32) << jnp.arange(_WORD, dtype=jnp.uint32), axis=-1)
+    shifted = padded.astype(jnp.uint32) << jnp.arange(_WORD, dtype=jnp.uint32)
+    return jnp.sum(shifted, axis=-1, dtype=jnp.uint32)
 
 
 def nth_set_bit(words: Array, rank: Array) -> Int32[Array, "r k"]:

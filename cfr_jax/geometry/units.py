@@ -143,15 +143,28 @@ def to_unit(
     rows = used_rows
     used = points[rows].astype(np.float32)
     count = len(used)
-    size = bucket(count) if count > neighbors else count
+    # a point of a small cloud has no more neighbors than there are others: the rest is padding, too
+    size = bucket(count) if count > neighbors + 1 else neighbors + 1
     k = min(neighbors, count - 1)
     pad = ((0, size - count), (0, 0))
-    found = np.pad(nearest_on_host(used, k, radius=radius), pad) if search else None
+    found = np.pad(_neighbors(used, k, radius, neighbors), pad) if search else None
     normals = None
     if cloud.normals is not None:
         normals = motions.rotate(motion, cloud.normals[rows]).astype(np.float32)
         normals = np.pad(normals, pad)
     return UnitCloud(np.pad(used, pad), normals, found, np.arange(size) < count, rows, k)
+
+
+def _neighbors(
+    points: Float[np.ndarray, "n 3"], k: int, radius: float, columns: int
+) -> Int[np.ndarray, "n columns"]:
+    """The k nearest of each point; in the columns that are left, the nearest one again."""
+    found = nearest_on_host(points, k, radius=radius)
+    if k == columns:
+        return found
+    away = np.linalg.norm(points[found] - points[:, None], axis=2)
+    nearest = np.take_along_axis(found, away.argmin(axis=1)[:, None], axis=1)
+    return np.hstack([found, np.repeat(nearest, columns - k, axis=1)])
 
 
 def thinned(unit: UnitCloud, *, budget: int, neighbors: int, radius: float, seed: int) -> UnitCloud:

@@ -142,6 +142,8 @@ def _as_array(obj: Any) -> np.ndarray:
 
 
 def _checked(obj: Any, array: np.ndarray) -> np.ndarray:
+    if array.dtype.name == "bfloat16":  # a type of its own to numpy
+        return array.astype(np.float32)
     if array.dtype.kind not in "fiu":
         raise ValueError(f"got {_kind(obj)} of {array.dtype}; {_WANTED} of floats or integers")
     return array

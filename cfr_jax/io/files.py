@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from cfr_jax.io import formats
 from cfr_jax.io.cloud import CloudFileError, CloudWarning, PointCloud
@@ -42,7 +43,8 @@ def read(
     x, y, z and unit vectors.
 
     Args:
-        path: a file of any format that `cfr register --help` lists.
+        path: a file of any format that `cfr register --help` lists. "pair.npz:src" is the array
+            `src` of an archive that holds several clouds.
         samples: points to draw from a surface: 10,000 if None; 0 takes the vertices of the mesh
             instead. A cloud has no surface, so this does not thin it.
         seed: of the drawing; the same seed gives the same points.
@@ -84,7 +86,7 @@ def read_shape(
     `columns` and `whole` are the `columns` and `properties` of `read`. Raises CloudFileError as
     `read` does.
     """
-    path = Path(path)
+    path, member = _member_of(Path(path))
     try:
         if os.path.isdir(path):
             raise CloudFileError("is a folder, wanted a file")
@@ -92,7 +94,11 @@ def read_shape(
         if columns is not None and not form.has_columns:
             raise CloudFileError(f"columns: {form.name} files say themselves what they hold")
         place = (path.parent,) if form.needs_folder else ()
-        options = {"columns": columns, "whole": whole} if form.has_columns else {}
+        options: dict[str, Any] = {}
+        if form.has_columns:
+            options = {"columns": columns, "whole": whole}
+        if member is not None:
+            options["member"] = member
         held = form.parse(contents(path), path.name, *place, **options)
     except ValueError as error:
         raise CloudFileError(f"{shown(path)}: {error}") from None
@@ -102,6 +108,14 @@ def read_shape(
             "PointCloud or a Mesh (`Table.shape` makes one)"
         )
     return held
+
+
+def _member_of(path: Path) -> tuple[Path, str | None]:
+    """A file, and the array that its name asks for: "pair.npz:src" is `src` of pair.npz."""
+    archive, colon, member = path.name.rpartition(":")
+    if colon and archive.lower().endswith(".npz") and not path.exists():
+        return path.with_name(archive), member
+    return path, None
 
 
 def write(path: str | os.PathLike[str], cloud: PointCloud) -> None:

@@ -10,10 +10,11 @@ from jaxtyping import Float, Int
 
 from cfr_jax.io import PointCloud
 from cfr_jax.multiway.scans import LeftOut
+from cfr_jax.runtime.values import ByValue
 
 
 @dataclass(frozen=True, eq=False)
-class Edge:
+class Edge(ByValue):
     """A pair of scans that was registered."""
 
     source: int
@@ -37,7 +38,7 @@ class Edge:
 
 
 @dataclass(frozen=True, eq=False)
-class Fused:
+class Fused(ByValue):
     """A merged cloud."""
 
     points: Float[np.ndarray, "n 3"]
@@ -57,7 +58,7 @@ class Fused:
 
 
 @dataclass(frozen=True, eq=False)
-class Merged:
+class Merged(ByValue):
     """The answer of `merge`. Everything is in the caller's unit."""
 
     names: tuple[str, ...]
@@ -84,6 +85,8 @@ class Merged:
     """The merged cloud of each component; empty if only poses were wanted."""
     seconds: dict[str, float]
     """`read`, `register`, `place`, `refine`, `fuse`, and `total`."""
+
+    _not_compared = ("seconds",)
 
     def pose(self, scan: int | str) -> Float[np.ndarray, "4 4"]:
         """The pose of a scan, by its index or name. Raises KeyError if it has none."""

@@ -22,9 +22,11 @@ from cfr_jax.multiway.reporting import answer
 from cfr_jax.multiway.scans import LeftOut, Scan, load, names_of, of_other_sizes, twins
 from cfr_jax.multiway.searching import closures, searched
 from cfr_jax.networks.record import Params
+from cfr_jax.runtime.entries import entry
 from cfr_jax.runtime.progress import Progress
 
 
+@entry
 def merge(
     clouds: Sequence[Any],
     *,

@@ -13,13 +13,14 @@ from jaxtyping import Array, Bool, Float
 
 from cfr_jax.geometry import rigid
 from cfr_jax.networks.probability import SURE, Calibration, logit
+from cfr_jax.runtime.values import ByValue
 
 _HIGHEST = lax.Precision.HIGHEST
 _SMALLEST, _LARGEST = 0.2, 1.5  # root mean square radii of clouds of about unit size, and no other
 
 
-@struct.dataclass
-class NetworkClues:
+@struct.dataclass(eq=False)
+class NetworkClues(ByValue):
     """What the network alone knows about its answer; each clue is of order one."""
 
     source_found: Float[Array, ""]

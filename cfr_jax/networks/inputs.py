@@ -19,6 +19,8 @@ from cfr_jax.geometry.normals import estimate_normals
 from cfr_jax.networks.extraction import Activations
 from cfr_jax.networks.features import PairFeature
 from cfr_jax.networks.sinkhorn import Form
+from cfr_jax.runtime.entries import entry
+from cfr_jax.runtime.values import ByValue
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,8 +51,8 @@ class Settings:
     instead of passing on the features of the iteration before."""
 
 
-@struct.dataclass
-class Cloud:
+@struct.dataclass(eq=False)
+class Cloud(ByValue):
     """A cloud ready for the network, with normals and neighbors; `mask` marks the valid rows."""
 
     points: Float[Array, "n 3"]
@@ -59,6 +61,7 @@ class Cloud:
     mask: Bool[Array, " n"] | None = None
 
 
+@entry
 @functools.partial(jax.jit, static_argnames=("settings",))
 def prepare(
     points: Float[Array, "n c"],

@@ -18,12 +18,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from cfr_jax.networks.layers import Layer, Norm, norm_of, projections
+from cfr_jax.runtime.tracing.gradients import with_gradient
 
 _HIGHEST = lax.Precision.HIGHEST  # for products that become variances
 # Rows of a tile. On a CPU that is 64 MiB of 1,024 channels: clouds of the usual size are one tile.
 _ON_CPU, _ELSEWHERE = 1 << 14, 1 << 18
 
-_Residuals = tuple[Layer, Array, Array, tuple[Array, Array, Array], Norm, Array, Array]
+_Needed = tuple[tuple[Array, Array, Array], Norm, Array, Array]
 
 
 def pooled_layer(
@@ -41,17 +42,13 @@ def pooled_layer(
     a CPU and `elsewhere` rows on other platforms.
     """
     valid = jnp.ones(x.shape[0], x.dtype) if mask is None else mask.astype(x.dtype)
-    return _pooled(layer, x, valid, groups, (on_cpu, elsewhere))
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
-def _pooled(layer: Layer, x: Array, valid: Array, groups: int, rows: tuple[int, int]) -> Array:
-    return _forward(layer, x, valid, groups, rows)[0]
+    there = functools.partial(_forward, groups=groups, rows=(on_cpu, elsewhere))
+    return with_gradient(there, functools.partial(_backward, groups), layer, x, valid)
 
 
 def _forward(
-    layer: Layer, x: Array, valid: Array, groups: int, rows: tuple[int, int]
-) -> tuple[Array, _Residuals]:
+    layer: Layer, x: Array, valid: Array, *, groups: int, rows: tuple[int, int]
+) -> tuple[Array, _Needed]:
     count = jnp.maximum(jnp.sum(valid), 1)
     mean = valid @ x / count
     centered = (x - mean) * valid[:, None]
@@ -63,7 +60,7 @@ def _forward(
     high, chosen = _highest(x, layer.kernel * sign, valid, rows)
     normal = (high * sign + layer.bias - norm.mean) * norm.rate
     pooled = jax.nn.relu(normal * layer.scale + layer.shift)
-    return pooled, (layer, x, valid, (mean, covariance, channel_mean), norm, normal, chosen)
+    return pooled, ((mean, covariance, channel_mean), norm, normal, chosen)
 
 
 def _highest(x: Array, kernel: Array, valid: Array, rows: tuple[int, int]) -> tuple[Array, Array]:
@@ -115,9 +112,10 @@ def _of_tiles(x: Array, kernel: Array, valid: Array, *, rows: int) -> tuple[Arra
 
 
 def _backward(
-    groups: int, rows: tuple[int, int], residuals: _Residuals, gradient: Array
-) -> tuple[Layer, Array, Array]:
-    layer, x, valid, (mean, covariance, channel_mean), norm, normal, chosen = residuals
+    groups: int, arguments: tuple[Layer, Array, Array], needed: _Needed, gradient: Array
+) -> tuple[Layer, Array, None]:
+    layer, x, valid = arguments
+    (mean, covariance, channel_mean), norm, normal, chosen = needed
     count = jnp.maximum(jnp.sum(valid), 1)
     shift = jnp.where(normal * layer.scale + layer.shift > 0, gradient, 0)
     scale = shift * normal
@@ -131,7 +129,4 @@ def _backward(
     dense = level @ layer.kernel.T + (x - mean) @ ((slope * steep) @ layer.kernel.T)
     d_x = -dense * valid[:, None]
     d_x = d_x.at[chosen].add(sparse[:, None] * layer.kernel.T)
-    return Layer(kernel, sparse - count * level, scale, shift), d_x, jnp.zeros_like(valid)
-
-
-_pooled.defvjp(_forward, _backward)
+    return Layer(kernel, sparse - count * level, scale, shift), d_x, None

@@ -25,6 +25,7 @@ from jax import export as jax_export
 
 from cfr_jax.runtime.atomic import write_atomically
 from cfr_jax.runtime.checksums import sealed, unsealed
+from cfr_jax.runtime.entries import entry
 from cfr_jax.runtime.private import make_private
 
 _UNUSED = 30 * 24 * 3600.0  # seconds without use after which a program is deleted
@@ -69,6 +70,7 @@ def storable_static(node: type, write: Callable[[Any], str], read: Callable[[str
     )
 
 
+@entry
 def compiled(function: Callable, *arguments: Any, **static: Any) -> Callable:
     """The compiled program of a jitted function for arguments of these shapes and types.
 

@@ -22,6 +22,7 @@ from cfr_jax.networks.clues import NetworkClues
 from cfr_jax.networks.probability import KEY, Calibration, calibration_of, uncalibrated
 from cfr_jax.networks.record import Network, Params
 from cfr_jax.runtime.atomic import write_atomically
+from cfr_jax.runtime.entries import entry
 from cfr_jax.runtime.messages import Refused, shown
 from cfr_jax.runtime.reading import contents, parse_json
 
@@ -83,6 +84,7 @@ def save_params(
         raise OSError(f"weights: {path} could not be written ({error})") from error
 
 
+@entry
 def load_params(source: str | Path = DEFAULT, network: str = "cfr") -> Params:
     """Parameters that ship with the package, by name, or from a .safetensors file, by path.
 

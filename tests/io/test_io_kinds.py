@@ -91,7 +91,7 @@ REFUSED = {
     "a promise of more": ("a.pts", ["61", *LINES], "says in front that it has 61 points, holds 60"),
     "a row too wide": ("a.csv", ["x,y,z", *COMMAS[:4], "1,2,3,4"], "line 6: .* from 3 to 4"),
     "decimal commas as separators": ("a.csv", ["x,y,z", "1,5,2,5,3,5"], "names 3 .* have 6"),
-    "two clouds": ("a.npz", npz(src=XYZ, ref=XYZ), "wanted an array 'points'.* got 'ref', 'src'"),
+    "two clouds": ("a.npz", npz(src=XYZ, ref=XYZ), "got 'ref', 'src'; FILE.npz:src names"),
     "three floats a row": ("a.bin", XYZ.astype("<f4").tobytes(), "no rows of 16 as in KITTI"),
     "a picture": ("a.npy", npy(np.zeros((6, 10, 3), np.uint8)), "an image"),
     "a cloud on its side": ("a.npy", npy(XYZ[:20].T.copy()), "transposed"),
@@ -145,3 +145,15 @@ def test_a_solid_more_is_a_part_of_the_surface(tmp_path):
     cloud = read(put(tmp_path, "a.stl", solids()), samples=0)
     assert {tuple(row) for row in cloud.points} == {tuple(row) for row in surface().vertices}
     assert len(cloud) == 36
+
+
+def test_an_array_of_an_archive_is_read_by_its_name(tmp_path):
+    source, target = np.random.default_rng(0).normal(size=(2, 20, 3))
+    np.savez(tmp_path / "pair.npz", src=source, ref=target, motion=np.eye(4))
+
+    assert np.array_equal(read(tmp_path / "pair.npz:src").points, source)
+    assert np.array_equal(read(f"{tmp_path}/pair.npz:ref").points, target)
+    with pytest.raises(
+        CloudFileError, match="no array 'tgt', wanted one of 'motion', 'ref', 'src'"
+    ):
+        read(tmp_path / "pair.npz:tgt")

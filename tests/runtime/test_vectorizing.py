@@ -7,7 +7,7 @@ import pytest
 
 from cfr_jax.networks.extraction import pooled_features
 from cfr_jax.networks.layers import Layer
-from cfr_jax.runtime.vectorizing import cloud_by_cloud
+from cfr_jax.runtime.tracing.vectorizing import cloud_by_cloud
 
 
 def parts(weights, rows):

@@ -14,15 +14,17 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from cfr_jax.geometry import rigid
+from cfr_jax.geometry.neighbors import others
 from cfr_jax.networks.cfr.modules import CFR
 from cfr_jax.networks.features import raw_features
 from cfr_jax.networks.inputs import Cloud, Settings, moved_by
 from cfr_jax.networks.record import Params, Step
 from cfr_jax.networks.sinkhorn import Affinity, match
+from cfr_jax.runtime.values import ByValue
 
 
-@struct.dataclass
-class Encoded:
+@struct.dataclass(eq=False)
+class Encoded(ByValue):
     """The target's side of a registration, computed once for any number of sources."""
 
     cloud: Cloud
@@ -105,4 +107,5 @@ def bind(params: Params) -> CFR:
 def heavy_features(network: CFR, cloud: Cloud, settings: Settings) -> Float[Array, "n d"]:
     """The heavy features that all iterations start from, before any light layer."""
     raw = raw_features(cloud.points, cloud.normals, cloud.neighbors, ppf=settings.ppf)
-    return network.features(raw, cloud.mask, settings.activations)
+    columns = others(cloud.mask, cloud.neighbors.shape[1])
+    return network.features(raw, cloud.mask, settings.activations, columns)

@@ -32,6 +32,7 @@ class PointFeatures(nn.Module):
         raw: Float[Array, "n k c"],
         mask: Bool[Array, " n"] | None = None,
         activations: Activations = "float32",
+        columns: Bool[Array, " k"] | None = None,
     ) -> Float[Array, "n d"]:
         layers, width = [], raw.shape[-1]
         for i in range(3):
@@ -45,7 +46,12 @@ class PointFeatures(nn.Module):
             )
             width = CHANNELS
         return pooled_features(
-            tuple(layers), raw, groups=GROUPS, mask=mask, activations=activations
+            tuple(layers),
+            raw,
+            groups=GROUPS,
+            mask=mask,
+            columns=columns,
+            activations=activations,
         )
 
 

@@ -30,10 +30,12 @@ from cfr_jax.networks.clues import (
 from cfr_jax.networks.inputs import Cloud, Settings, check_points, prepare
 from cfr_jax.networks.probability import calibration_of
 from cfr_jax.networks.record import Params
+from cfr_jax.runtime.entries import entry
+from cfr_jax.runtime.values import ByValue
 
 
-@struct.dataclass
-class Registration:
+@struct.dataclass(eq=False)
+class Registration(ByValue):
     """The answer of `register`."""
 
     transforms: Float[Array, "L 4 4"]
@@ -62,6 +64,7 @@ class Registration:
         return self.transforms[..., -1, :, :]
 
 
+@entry
 def encode(
     params: Params,
     target: Float[Array | np.ndarray, "m c"] | Cloud,
@@ -86,6 +89,7 @@ def _encode(params: Params, target: Array | Cloud, *, settings: Settings) -> Enc
     return encoded(params, _prepared("target", target, settings), settings)
 
 
+@entry
 def register(
     params: Params,
     source: Float[Array | np.ndarray, "n c"] | Cloud,
@@ -108,10 +112,16 @@ def register(
     that are nearly aligned. A further cascade takes as long as another registration onto an encoded
     target.
 
-    Gradients flow through everything but the choice of neighbors. Raises ValueError for wrong
-    shapes, for masked arrays with masked values, and for values that are not finite or lie so far
-    out that float32 cannot tell points apart. Inside `jit` and `vmap` the values are not known, and
-    NaN in gives NaN out. Clouds of another than unit size are not refused; the confidence falls.
+    Derivatives exist for everything but the choice of neighbors, which is held fixed: in reverse
+    mode (`jax.grad`, `jax.jacrev`), in forward mode (`jax.jacfwd`, `jax.jvp`), and of second order
+    (`jax.hessian`). Only reverse mode is written by hand to save memory; the others keep what JAX
+    keeps, and take longer to compile.
+
+    Raises ValueError for wrong shapes, for masked arrays with masked values, and for values that
+    are not finite or lie so far out that float32 cannot tell points apart. Inside `jit` and `vmap`
+    the values are not known, and NaN in gives NaN out. Clouds of another than unit size are not
+    refused; the confidence falls. Raises RuntimeError in a process that was forked after the first
+    call.
     """
     check_params(params)
     for name, count in (("iterations", iterations), ("cascades", cascades)):

@@ -23,8 +23,8 @@ def backward(
     *,
     groups: int,
     limits: Limits,
-) -> tuple[tuple[Layer, Layer, Layer], Float[Array, "n k c"], Float[Array, " n"]]:
-    """Gradients with respect to the layers, the raw channels, and `valid` (zeros)."""
+) -> tuple[tuple[Layer, Layer, Layer], Float[Array, "n k c"]]:
+    """Gradients with respect to the layers and the raw channels."""
     one, two, three = layers
     (norm_one, norm_two, norm_three), normal, second = kept
     n, k, channels = raw.shape
@@ -126,4 +126,4 @@ def backward(
         Layer(kernel_two, bias_two, scale_two, shift_two),
         Layer(kernel_three, bias_three, scale_three, shift_three),
     )
-    return gradients, d_raw.reshape(raw.shape), jnp.zeros_like(valid)
+    return gradients, d_raw.reshape(raw.shape)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import functools
 
-import jax
 import jax.numpy as jnp
 from jax.experimental.layout import Layout, with_layout_constraint
 from jax.typing import DTypeLike
@@ -22,6 +21,7 @@ from jaxtyping import Array, Float
 
 from cfr_jax.networks.extraction.whole import Values, forward
 from cfr_jax.networks.layers import Layer, Norm, projections
+from cfr_jax.runtime.tracing.gradients import with_gradient
 
 _Layers = tuple[Layer, Layer, Layer]
 
@@ -36,27 +36,21 @@ def pooled_mixed(
     """`extraction.pooled_features`, except that features of invalid points are not yet zero.
 
     `valid` is 1 for valid points and 0 for the others. `stored` is the type of the activations. The
-    gradient has a rule of its own and can be taken once.
+    gradient has a rule of its own.
     """
-    return _pooled(layers, raw, valid, groups, stored)
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
-def _pooled(layers: _Layers, raw: Array, valid: Array, groups: int, stored: DTypeLike) -> Array:
-    return _forward(layers, raw, valid, groups, stored)[0]
-
-
-def _forward(
-    layers: _Layers, raw: Array, valid: Array, groups: int, stored: DTypeLike
-) -> tuple[Array, tuple[_Layers, Array, Array, Values]]:
-    pooled, values = forward(layers, raw, valid, groups=groups, stored=stored)
-    return pooled, (layers, raw, valid, values)
+    there = functools.partial(forward, groups=groups, stored=stored)
+    back = functools.partial(_backward, groups, stored)
+    return with_gradient(there, back, layers, raw, valid)
 
 
 def _backward(
-    groups: int, stored: DTypeLike, residuals: tuple[_Layers, Array, Array, Values], gradient: Array
-) -> tuple[_Layers, Array, Array]:
-    (one, two, three), raw, valid, values = residuals
+    groups: int,
+    stored: DTypeLike,
+    arguments: tuple[_Layers, Array, Array],
+    values: Values,
+    gradient: Array,
+) -> tuple[_Layers, Array, None]:
+    (one, two, three), raw, valid = arguments
     means, covariance, norms, normal, x, y_one, z_two, y_two, z_three = values
     mean, mean_two, mean_three = means
     norm_one, norm_two, norm_three = norms
@@ -113,10 +107,7 @@ def _backward(
         Layer(kernel_two, bias_two, scale_two, shift_two),
         Layer(kernel_three, bias_three, scale_three, shift_three),
     )
-    return gradients, d_raw, jnp.zeros_like(valid)
-
-
-_pooled.defvjp(_forward, _backward)
+    return gradients, d_raw, None
 
 
 def _sum(values: Array) -> Array:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
+
+from cfr_jax.runtime.tracing.gradients import with_gradient
 
 
 def highest(x: Float[Array, "*rows k c"]) -> Float[Array, "*rows c"]:
@@ -14,28 +15,18 @@ def highest(x: Float[Array, "*rows k c"]) -> Float[Array, "*rows c"]:
     the entries with the maximum and divides by how many are equal: none is, and the gradient NaN,
     where a compiler makes the entries twice and rounds them apart.
     """
-    return _highest(x)
+    return with_gradient(_forward, _backward, x)
 
 
-@jax.custom_vjp
-def _highest(x: Array) -> Array:
-    return jnp.max(x, axis=-2)
-
-
-def _forward(
-    x: Float[Array, "*rows k c"],
-) -> tuple[Float[Array, "*rows c"], tuple[Int[Array, "*rows c"], Float[Array, " k"]]]:
+def _forward(x: Float[Array, "*rows k c"]) -> tuple[Float[Array, "*rows c"], Int[Array, "*rows c"]]:
     chosen = jnp.argmax(x, axis=-2)
     value = jnp.take_along_axis(x, chosen[..., None, :], axis=-2)[..., 0, :]
-    return value, (chosen, jnp.zeros(x.shape[-2], x.dtype))
+    return value, chosen
 
 
 def _backward(
-    kept: tuple[Int[Array, "*rows c"], Float[Array, " k"]], gradient: Float[Array, "*rows c"]
+    arguments: tuple[Array], chosen: Int[Array, "*rows c"], gradient: Float[Array, "*rows c"]
 ) -> tuple[Float[Array, "*rows k c"]]:
-    chosen, axis = kept
-    own = jnp.arange(len(axis), dtype=chosen.dtype)[:, None] == chosen[..., None, :]
+    (x,) = arguments
+    own = jnp.arange(x.shape[-2], dtype=chosen.dtype)[:, None] == chosen[..., None, :]
     return (jnp.where(own, gradient[..., None, :], 0),)
-
-
-_highest.defvjp(_forward, _backward)

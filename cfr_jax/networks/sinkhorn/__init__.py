@@ -46,9 +46,9 @@ def match(
 
     The result is finite for every finite affinity. Masked points take no part. `passes` and `form`
     are static. "auto" chooses by the number of entries of one pair and by the platform that the
-    program is lowered for (`form_for`); for a batch of large pairs ask for "streamed". Gradients
-    exist for everything but the masks; with forms other than "dense" and "log space" they can be
-    taken once. Raises ValueError for fewer than one pass and for an unknown form.
+    program is lowered for (`form_for`); for a batch of large pairs ask for "streamed". There are
+    derivatives for everything but the masks, also in forward mode. Raises ValueError for fewer than
+    one pass and for an unknown form.
     """
     if passes < 1:
         raise ValueError(f"passes: got {passes}, wanted at least 1")

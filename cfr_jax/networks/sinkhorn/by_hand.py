@@ -1,6 +1,6 @@
 """The forms of the match with a hand-written gradient, and the choice between them by platform.
 
-Their gradients need little memory and can be taken once. All forms leave the same trace, so a
+Their gradients need little memory. All forms leave the same trace, so a
 program that is not yet lowered can hold one form for CPUs and another for other platforms.
 """
 
@@ -10,13 +10,13 @@ import functools
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from cfr_jax.networks.sinkhorn import scaling, streamed
 from cfr_jax.networks.sinkhorn.affinity import Affinity, Match
+from cfr_jax.runtime.tracing.gradients import with_gradient
 
 _Masks = tuple[Array, Array]
 
@@ -46,19 +46,15 @@ def match_by_hand(
         jnp.ones(size, bool) if mask is None else mask
         for mask, size in zip((source_mask, target_mask), sizes, strict=True)
     )
-    return _match(affinity, points, (of_source, of_target), passes, (on_cpu, elsewhere))
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
-def _match(
-    affinity: Affinity, points: Array, masks: _Masks, passes: int, ways: tuple[Way, Way]
-) -> Match:
-    return _forward(affinity, points, masks, passes, ways)[0]
+    there, back = (
+        functools.partial(way, passes, (on_cpu, elsewhere)) for way in (_forward, _backward)
+    )
+    return with_gradient(there, back, affinity, points, (of_source, of_target))
 
 
 def _forward(
-    affinity: Affinity, points: Array, masks: _Masks, passes: int, ways: tuple[Way, Way]
-) -> tuple[Match, tuple[Affinity, Array, _Masks, scaling.Trace]]:
+    passes: int, ways: tuple[Way, Way], affinity: Affinity, points: Array, masks: _Masks
+) -> tuple[Match, scaling.Trace]:
     def run(
         way: Way, affinity: Affinity, points: Array, masks: _Masks
     ) -> tuple[Match, scaling.Trace]:
@@ -66,14 +62,14 @@ def _forward(
             return streamed.forward(affinity, points, masks, passes=passes, rows=way.rows)
         return scaling.forward(scaling.Stored(affinity, masks), points, passes)
 
-    found, trace = _by_platform(run, ways, affinity, points, masks)
-    return found, (affinity, points, masks, trace)
+    return _by_platform(run, ways, affinity, points, masks)
 
 
 def _backward(
     passes: int,
     ways: tuple[Way, Way],
-    residuals: tuple[Affinity, Array, _Masks, scaling.Trace],
+    arguments: tuple[Affinity, Array, _Masks],
+    trace: scaling.Trace,
     gradient: Match,
 ) -> tuple[Affinity, Array, None]:
     def run(
@@ -91,10 +87,7 @@ def _backward(
         block = scaling.Stored(affinity, masks, trace.shift)
         return scaling.backward(block, affinity, points, trace, gradient)
 
-    return *_by_platform(run, ways, *residuals, gradient), None
-
-
-_match.defvjp(_forward, _backward)
+    return *_by_platform(run, ways, *arguments, trace, gradient), None
 
 
 def _by_platform(run: Callable[..., Any], ways: tuple[Way, Way], *arguments: Any) -> Any:

@@ -32,12 +32,18 @@ _NORMALS = ("normals", "normal")
 
 
 def parse(
-    data: bytes, name: str, *, columns: tuple[str, ...] | None = None, whole: bool = False
+    data: bytes,
+    name: str,
+    *,
+    columns: tuple[str, ...] | None = None,
+    whole: bool = False,
+    member: str | None = None,
 ) -> PointCloud | Mesh:
     """The array that is called `points`, `xyz`, `pc`, `pcd` or the like, or the only one.
 
     Beside it `normals`, if there are any. Arrays x, y, z of equal length are a cloud, too. Several
-    clouds in one archive, as `src` and `ref`, are refused: nothing says which one is meant.
+    clouds in one archive, as `src` and `ref`, are refused unless `member` names one: nothing else
+    says which one is meant.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -47,7 +53,7 @@ def parse(
                 if not info.is_dir()
             }
             arrays = _Arrays(archive, members, len(data))
-            table, notes = _table(arrays, columns)
+            table, notes = _table(arrays, columns, member)
             if whole:
                 table = _with_all(table, arrays)
     except CloudFileError:
@@ -86,10 +92,17 @@ class _Arrays:
         return [key for key in self.members if key.lower() in wanted]
 
 
-def _table(arrays: _Arrays, columns: tuple[str, ...] | None) -> tuple[Table, tuple[str, ...]]:
+def _table(
+    arrays: _Arrays, columns: tuple[str, ...] | None, member: str | None
+) -> tuple[Table, tuple[str, ...]]:
     names = list(arrays.members)
     found = arrays.called(_POINTS) or arrays.called(_PAIRED)
-    if not found and are_names(names):
+    if member is not None:
+        if member not in names:
+            held = ", ".join(map(repr, sorted(names)[:8])) or "nothing"
+            raise CloudFileError(f"has no array {member!r:.60}, wanted one of {held}")
+        found = [member]
+    elif not found and are_names(names):
         roles = roles_of(names)
         chosen = [names[k] for k in (*roles.points, *roles.normals)]
         values = [arrays[key] for key in chosen]
@@ -100,12 +113,13 @@ def _table(arrays: _Arrays, columns: tuple[str, ...] | None) -> tuple[Table, tup
         return Table(tuple(chosen), tuple(values), inner, format="NPZ"), ()
     if len(found) != 1 and len(names) != 1:
         held = ", ".join(map(repr, sorted(names)[:8])) or "nothing"
+        choose = f"; FILE.npz:{found[0]:.40} names one" if found else "; FILE.npz:NAME names one"
         raise CloudFileError(
-            f"wanted an array 'points' (or 'xyz', 'pc', 'pcd'), or a single one, got {held}"
+            f"wanted an array 'points' (or 'xyz', 'pc', 'pcd'), or a single one, got {held}{choose}"
         )
     key = found[0] if found else names[0]
     array = arrays[key]
-    beside = arrays.called(_NORMALS)
+    beside = arrays.called(_NORMALS) if member is None else []
     if len(beside) == 1 and not array.dtype.names and columns is None:
         flat = array.reshape(-1, array.shape[-1])
         check_room(len(flat), 3 * POINT, arrays.size, "points with normals", arrays.taken)

@@ -32,6 +32,9 @@ def cloud_by_cloud(on_cpu: Callable, elsewhere: Callable) -> Callable:
         axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
         leaves, structure = jax.tree.flatten(arguments)
         flags = jax.tree.leaves(batched)
+        if not any(flags):  # as in a Jacobian, where tangents alone are batched
+            found = lax.platform_dependent(*arguments, cpu=on_cpu, default=elsewhere)
+            return found, jax.tree.map(lambda _: False, found)
 
         def in_turn(*leaves: Array) -> Any:
             def one(own: list[Array]) -> Any:
