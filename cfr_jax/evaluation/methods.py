@@ -31,7 +31,7 @@ _OURS = (
     "io/cloud.py",
     "networks/**/*.py",
     "refine/*.py",
-    "runtime/*.py",
+    "runtime/**/*.py",
     "weights/*.py",
     "evaluation/solvers/*.py",
 )

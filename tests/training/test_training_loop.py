@@ -124,7 +124,7 @@ def test_an_interrupted_run_resumes_bit_for_bit(corpus_file, tmp_path, whole, ki
 def test_the_weights_are_those_that_the_newest_checkpoint_calls_best(
     corpus_file, tmp_path, whole, monkeypatch
 ):
-    def killed(*_):
+    def killed(*_, **__):
         raise Killed
 
     with monkeypatch.context() as patch:

@@ -174,7 +174,8 @@ def way(
 
     The first is where the source's file has it. The start may be far from there: a second look or a
     search may have chosen it, and then it is nearly the answer."""
-    stations, labels = [np.eye(4)], ["start"]
+    stations: list[ArrayLike] = [np.eye(4)]
+    labels = ["start"]
     if initial is not None:
         stations, labels = [np.eye(4), initial], ["as given", "start"]
     for number, transform in enumerate(transforms, start=1):
