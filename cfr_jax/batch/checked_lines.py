@@ -15,7 +15,8 @@ from cfr_jax.runtime.reading import opened, parse_json
 _CHECK = 16  # hexadecimal digits
 _END = re.compile(rb', "check": "([0-9a-f]{%d})"}\n' % _CHECK)
 _END_SIZE = len(', "check": ""}\n') + _CHECK
-_LONGEST_LINE = 1 << 26  # bytes; a record has a few thousand
+# Bytes; a record has a few thousand. Parsed JSON can take many times the memory of its text.
+_LONGEST_LINE = 1 << 22
 
 
 def line_of(value: dict[str, Any]) -> bytes:
@@ -57,7 +58,8 @@ def _record(line: bytes, where: str, header: bool = False) -> dict[str, Any]:
     """The value of a line whose checksum fits."""
     try:
         end = _END.fullmatch(line[-_END_SIZE:])
-        if end is None or _check(line[:-_END_SIZE] + b"}").encode() != end[1]:
+        bare = memoryview(line)[:-_END_SIZE]  # a line may be long, and is not copied
+        if end is None or _check(bare, b"}").encode() != end[1]:
             if header and line.startswith(b'{"format": "cfr_jax/batch/1"'):
                 return parse_json(line)  # of the version without checksums
             raise Refused("its checksum does not fit")
@@ -80,5 +82,9 @@ def _is_record(value: Any) -> bool:
     )
 
 
-def _check(bare: bytes) -> str:
-    return hashlib.sha256(bare).hexdigest()[:_CHECK]
+def _check(*parts: bytes | memoryview) -> str:
+    """The start of the SHA-256 of a line in one or more parts."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part)
+    return digest.hexdigest()[:_CHECK]
