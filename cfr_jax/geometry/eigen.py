@@ -155,7 +155,7 @@ def least_direction(covariance: Float[Array, "3 3"]) -> Float[Array, " 3"]:
     at most 1e-5 of the matrix's largest entry (a line, a ball). The limit is relative, so it holds
     at every scale.
     """
-    return _least_and_rest(_unit_scale(covariance)[0])[0]
+    return _least_and_rest(covariance / size_of(covariance))[0]
 
 
 @jax.custom_jvp
@@ -218,7 +218,7 @@ def _inverse(values: Float[Array, " d"], vectors: Float[Array, "d d"]) -> Float[
     return jnp.matmul(vectors * inverse, vectors.T, precision=_HIGHEST)
 
 
-def _unit_scale(matrix: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Float[Array, ""]]:
-    largest = jnp.max(jnp.abs(matrix))
-    scale = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
-    return matrix / scale, scale
+def size_of(values: Float[Array, "*shape"]) -> Float[Array, ""]:
+    """The largest absolute value, or one if all are zero; a constant to derivatives."""
+    largest = jnp.max(jnp.abs(values), initial=0)
+    return lax.stop_gradient(jnp.where(largest > 0, largest, 1))

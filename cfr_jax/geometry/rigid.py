@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from cfr_jax.geometry.eigen import leading_eigenvector, pseudo_inverse
+from cfr_jax.geometry.eigen import leading_eigenvector, pseudo_inverse, size_of
 
 _HIGHEST = lax.Precision.HIGHEST
 
@@ -64,7 +64,7 @@ def fit_rigid(
     weights = weights / (jnp.sum(weights) + 1e-5)
     # The rotation does not depend on the scale of either cloud. Scaling both to about one keeps the
     # covariance within float32's range for clouds of any size, and needs no gradient.
-    size_source, size_target = (_largest(cloud) for cloud in (source, target))
+    size_source, size_target = (size_of(cloud) for cloud in (source, target))
     small_source, small_target = source / size_source, target / size_target
     center_source = jnp.matmul(weights, small_source, precision=_HIGHEST)
     center_target = jnp.matmul(weights, small_target, precision=_HIGHEST)
@@ -76,12 +76,6 @@ def fit_rigid(
     rotation = nearest_rotation(covariance)
     turned = jnp.matmul(rotation, center_source * size_source, precision=_HIGHEST)
     return from_parts(rotation, center_target * size_target - turned)
-
-
-def _largest(values: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """The largest absolute value, or one if all are zero; a constant to derivatives."""
-    largest = jnp.max(jnp.abs(values), initial=0)
-    return lax.stop_gradient(jnp.where(largest > 0, largest, 1))
 
 
 @jax.custom_jvp
@@ -97,8 +91,7 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     singular exactly where R is not unique. There its pseudo-inverse is used, with a relative
     threshold, so that the gradient stays finite at every scale.
     """
-    largest = jnp.max(jnp.abs(matrix))
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = (matrix / jnp.where(largest > 0, largest, 1)).reshape(9)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = (matrix / size_of(matrix)).reshape(9)
     horn = jnp.array(
         [
             [xx + yy + zz, zy - yz, xz - zx, yx - xy],
@@ -117,8 +110,7 @@ def _nearest_rotation_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tupl
     stretch = jnp.matmul(rotation.T, matrix, precision=_HIGHEST)
     stretch = (stretch + stretch.T) / 2
     system = jnp.trace(stretch) * jnp.eye(3, dtype=matrix.dtype) - stretch
-    largest = lax.stop_gradient(jnp.max(jnp.abs(system)))
-    scale = jnp.where(largest > 0, largest, 1)
+    scale = size_of(system)
     change = jnp.matmul(rotation.T, tangent / scale, precision=_HIGHEST)
     inverse = pseudo_inverse(system / scale)
     turn = jnp.matmul(inverse, _vee(change - change.T), precision=_HIGHEST)
