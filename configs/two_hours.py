@@ -2,11 +2,11 @@
 
 Every network takes the same time on one core of the same machine: a little more than two hours,
 22 % of it on clouds of 256 points, the rest on 717. CFR and RPM-Net have the data, augmentation,
-curriculum, loss and optimizer of `open_cad.py`. DCP-v2, FMR and RGM have those of their own configs,
-as published, but for clouds that grow, and batches of 8 where DCP published 32: at 717 points, a
-step of 32 pairs takes it 40 s. RGM has 128 channels instead of the published 512. (Seconds per step
-in the two phases, two networks side by side on two cores of an AMD EPYC with AVX2: CFR 0.65 and 2.2,
-RPM-Net 1.4 and 4.4, DCP 2.0 and 7.0, FMR 0.88 and 2.05, RGM 1.25 and 4.6.)
+curriculum, loss and optimizer of `open_cad.py`. DCP-v2, FMR and RGM have those of their own
+configs, as published, but for clouds that grow, and batches of 8 where DCP published 32: at 717
+points, a step of 32 pairs takes it 40 s. RGM has 128 channels instead of the published 512.
+(Seconds per step in the two phases, two networks side by side on two cores of an AMD EPYC with
+AVX2: CFR 0.65 and 2.2, RPM-Net 1.4 and 4.4, DCP 2.0 and 7.0, FMR 0.88 and 2.05, RGM 1.25 and 4.6.)
 """
 
 import pathlib
