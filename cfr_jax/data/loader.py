@@ -9,13 +9,13 @@ from __future__ import annotations
 import collections
 import functools
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int
 
 from cfr_jax.data.augmentation.sampling import Sampling
+from cfr_jax.data.worker_pool import open_pool
 
 
 @runtime_checkable
@@ -73,7 +73,8 @@ def batches(
     workers: int = 2,
     share: slice = slice(None),
 ) -> Iterator[dict[str, np.ndarray]]:
-    """`count` batches starting at `position`, prepared ahead of use by `workers` threads.
+    """`count` batches starting at `position`, prepared ahead of use by `workers` threads, or
+    processes where there are many (`worker_pool`).
 
     Only the rows of each batch that are in `share` are made, so that each of several processes
     makes only its own. Raises ValueError for fewer than one worker.
@@ -81,16 +82,12 @@ def batches(
     if workers < 1:
         raise ValueError(f"workers: got {workers}, wanted at least 1")
     start, stop, _ = share.indices(size)
-    with ThreadPoolExecutor(workers) as pool:
+    draw = functools.partial(batch_at, source, size=stop - start, sampling=sampling, seed=seed)
+    with open_pool(workers, draw) as submit:
         waiting: collections.deque = collections.deque()
-        try:
-            for number in range(count):
-                first = position + number * size + start
-                waiting.append(pool.submit(batch_at, source, first, stop - start, sampling, seed))
-                if len(waiting) > 2 * workers:
-                    yield waiting.popleft().result()
-            while waiting:
+        for number in range(count):
+            waiting.append(submit(position + number * size + start))
+            if len(waiting) > 2 * workers:
                 yield waiting.popleft().result()
-        finally:
-            for job in waiting:
-                job.cancel()
+        while waiting:
+            yield waiting.popleft().result()

@@ -132,8 +132,8 @@ def scene_source(
     """A source of the pairs that `read` returns; the most recent ones are kept in memory.
 
     Each pair needs its true motion. `names` and `frames` are those of `SceneSource`, with one entry
-    per item. `files` are all files that are read, for the stamp. Raises ValueError if there are no
-    items.
+    per item. `read` must be picklable, for workers that are processes. `files` are all files that
+    are read, for the stamp. Raises ValueError if there are no items.
     """
     if not names:
         clouds = " ".join(by_suffix(form for form in formats.of_clouds() if form.loose))
@@ -142,18 +142,38 @@ def scene_source(
     sizes = [file.stat().st_size if file.is_file() else -1 for file in files]
     stamp = hashlib.sha256(repr((list(names), sizes)).encode()).hexdigest()
 
-    @functools.lru_cache(_HELD)
-    def held(row: int) -> Pair:
-        pair = read(row)
-        where = f"{path}: {names[row]}"
-        source = target = _held(
-            where if single else f"{where}: source", pair.source, pair.source_normals
-        )
-        if not single:
-            target = _held(f"{where}: target", pair.target, pair.target_normals)
-        return Pair(pair.name, source[0], target[0], source[1], target[1], pair.transform)
+    return SceneSource(
+        tuple(names), tuple(frames), _Recent(path, tuple(names), read, single), stamp, single
+    )
 
-    return SceneSource(tuple(names), tuple(frames), held, stamp, single)
+
+class _Recent:
+    """Reads items, and keeps the most recent ones. Its copy in another process starts empty."""
+
+    def __init__(
+        self, path: str | Path, names: tuple[str, ...], read: Callable[[int], Pair], single: bool
+    ):
+        self._given = path, names, read, single
+        self.recent = functools.lru_cache(_HELD)(functools.partial(_read, *self._given))
+
+    def __call__(self, row: int) -> Pair:
+        return self.recent(row)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Recent, self._given
+
+
+def _read(
+    path: str | Path, names: tuple[str, ...], read: Callable[[int], Pair], single: bool, row: int
+) -> Pair:
+    pair = read(row)
+    where = f"{path}: {names[row]}"
+    source = target = _held(
+        where if single else f"{where}: source", pair.source, pair.source_normals
+    )
+    if not single:
+        target = _held(f"{where}: target", pair.target, pair.target_normals)
+    return Pair(pair.name, source[0], target[0], source[1], target[1], pair.transform)
 
 
 def _held(

@@ -128,7 +128,7 @@ class TrainSection:
     pairs_at_once: int = 1  # vectorized pairs per device; on an accelerator, as many as fit
     max_skipped: int = 20  # steps in a row that may lack a finite gradient; after more, it stops
     draw: str = "host"  # where pairs are drawn: "host", or "device" for pairs of shapes
-    workers: int = 1  # threads that draw pairs on the host
+    workers: int = 1  # how many draw pairs on the host: threads; from five on, processes
     steps_at_once: int = 1  # steps per program, if the device draws
     minutes: float = 0.0  # length in wall-clock time, for a single phase; 0: by the phase's steps
     start_from: str = ""  # weights to start from, by name or path; "": random weights

@@ -1,5 +1,6 @@
 """Training data by name: shapes, pairs of scans, drives, single scans, and mixtures."""
 
+import pickle
 from pathlib import Path
 
 import h5py
@@ -210,10 +211,10 @@ def test_scans_that_cannot_be_read_are_all_named_before_any_training(tmp_path, s
         (scans / name).unlink()
     mixture = opened()
     mixtures.check_readable(mixture, cache, "data.train")
-    reads = mixture.sources[0].read.cache_info().misses
+    reads = mixture.sources[0].read.recent.cache_info().misses
     again = opened()
     mixtures.check_readable(again, cache, "data.train")
-    assert reads == 1 and again.sources[0].read.cache_info().misses == 0  # remembered
+    assert reads == 1 and again.sources[0].read.recent.cache_info().misses == 0  # remembered
 
 
 def test_scans_of_too_few_points_are_named_before_any_training(tmp_path, surface):
@@ -290,6 +291,25 @@ def test_lists_that_name_the_same_file_share_a_scan(tmp_path, surface, motion):
     folder = mixtures.open_mixture({"a": about}, tmp_path, "data.validation")
     with pytest.raises(ValueError, match="2 of its 3 scans are also in data.train"):
         mixtures.check_apart(opened("train.csv"), folder)
+
+
+def test_sources_draw_the_same_in_another_process(pairs_file, drive, tmp_path, surface, motion):
+    """Workers that are processes get a source by pickling."""
+    io.write(tmp_path / "cloud.ply", io.PointCloud(surface))
+    numbers = ",".join(map(repr, motion.ravel().tolist()))
+    (tmp_path / "train.csv").write_text(f"cloud.ply,cloud.ply,{numbers}\n")
+
+    for source in (
+        pair_file.train(pairs_file, NO_CACHE),
+        pair_list.train(tmp_path / "train.csv", NO_CACHE),
+        clouds.train(tmp_path, NO_CACHE),
+        kitti.train(drive, tmp_path / "cache", distances=(4.0,)),
+    ):
+        copy = pickle.loads(pickle.dumps(source))
+        pair, same = (each.draw(0, WHOLE, np.random.default_rng(0)) for each in (source, copy))
+        assert pair.keys() == same.keys()
+        for key in pair:
+            np.testing.assert_array_equal(pair[key], same[key])
 
 
 def test_named_sources_are_mixed_as_often_as_configured(pairs_file, tmp_path):

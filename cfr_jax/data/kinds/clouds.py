@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,10 +30,6 @@ def unlikely(path: Path) -> bool:
 
 def train(path: str | Path, cache: Path) -> SceneSource:
     """Pairs of two views of one cloud, which need no known motion between clouds."""
-    import numpy as np
-
-    from cfr_jax import io
-    from cfr_jax.data.pairs import Pair
     from cfr_jax.data.scenes import scene_source
 
     folder = Path(path)
@@ -40,19 +37,25 @@ def train(path: str | Path, cache: Path) -> SceneSource:
         raise ValueError(f"path: there is no folder of scans at {folder}")
     files = list_scans(folder)
 
-    def read(row: int) -> Pair:
-        scan = io.read(files[row])
-        clouds = scan.points, scan.points, scan.normals, scan.normals
-        return Pair(files[row].name, *clouds, transform=np.eye(4))
-
     return scene_source(
         path,
         names=[file.relative_to(folder).as_posix() for file in files],
         frames=[((str(file.resolve()),),) for file in files],
-        read=read,
+        read=functools.partial(_read, files),
         files=files,
         single=True,
     )
+
+
+def _read(files: list[Path], row: int) -> Pair:
+    import numpy as np
+
+    from cfr_jax import io
+    from cfr_jax.data.pairs import Pair
+
+    scan = io.read(files[row])
+    clouds = scan.points, scan.points, scan.normals, scan.normals
+    return Pair(files[row].name, *clouds, transform=np.eye(4))
 
 
 def list_scans(path: Path) -> list[Path]:

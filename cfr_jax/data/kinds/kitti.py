@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from cfr_jax.data.kinds.kind import DataKind
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from cfr_jax.data.pairs import Pair
     from cfr_jax.data.scenes import SceneSource
+
+    _Item: TypeAlias = tuple[str, int, int, np.ndarray]  # sequence, two frames, motion
 
 
 def recognize(path: Path) -> str | None:
@@ -37,10 +42,10 @@ def train(
     lie in the half-open range `frames` (None: all).
     """
     from cfr_jax.data import kitti
-    from cfr_jax.data.pairs import Pair, among
+    from cfr_jax.data.pairs import among
     from cfr_jax.data.scenes import scene_source
 
-    items = []
+    items: list[_Item] = []
     for sequence in sequences:
         for distance in distances:
             found = kitti.read_pairs(
@@ -50,19 +55,23 @@ def train(
                 if among(frames, (a, b)):
                     items.append((sequence, a, b, transform))
 
-    def read(row: int) -> Pair:
-        sequence, a, b, transform = items[row]
-        source, target = (kitti.read_frame(path, sequence, frame) for frame in (a, b))
-        return Pair(f"{sequence}/{a:06d}-{b:06d}", source, target, transform=transform)
-
     where = str(Path(path).resolve())
     return scene_source(
         path,
         names=[f"{sequence}/{a:06d}-{b:06d}" for sequence, a, b, _ in items],
         frames=[((where, sequence, a), (where, sequence, b)) for sequence, a, b, _ in items],
-        read=read,
+        read=functools.partial(_read, path, items),
         files=[file for sequence in sequences for file in _sequences(Path(path))[sequence]],
     )
+
+
+def _read(path: str | Path, items: list[_Item], row: int) -> Pair:
+    from cfr_jax.data import kitti
+    from cfr_jax.data.pairs import Pair
+
+    sequence, a, b, transform = items[row]
+    source, target = (kitti.read_frame(path, sequence, frame) for frame in (a, b))
+    return Pair(f"{sequence}/{a:06d}-{b:06d}", source, target, transform=transform)
 
 
 def evaluate(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from cfr_jax.data.folders import hdf5_members
 from cfr_jax.data.kinds.kind import DataKind, Listing
 
 if TYPE_CHECKING:
-    from cfr_jax.data.pairs import Pair
+    from cfr_jax.data.pairs import Pair, PairFile
     from cfr_jax.data.scenes import SceneSource
 
 
@@ -27,7 +28,7 @@ def train(path: str | Path, cache: Path, *, frames: tuple[int, int] | None = Non
 
     None means all pairs. Each pair needs its true transform.
     """
-    from cfr_jax.data.pairs import Hdf5Pairs, among, with_truth
+    from cfr_jax.data.pairs import Hdf5Pairs, among
     from cfr_jax.data.scenes import scene_source
 
     held = Hdf5Pairs(path)
@@ -43,9 +44,15 @@ def train(path: str | Path, cache: Path, *, frames: tuple[int, int] | None = Non
         path,
         names=[held.names[row] for row in rows],
         frames=[tuple((where, frame) for frame in numbers[row]) for row in rows],
-        read=lambda index: with_truth(held, rows[index]),
+        read=functools.partial(_read, held, rows),
         files=[held.path],
     )
+
+
+def _read(held: PairFile, rows: list[int], index: int) -> Pair:
+    from cfr_jax.data.pairs import with_truth
+
+    return with_truth(held, rows[index])
 
 
 def evaluate(

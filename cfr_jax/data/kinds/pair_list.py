@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import os
 from collections.abc import Sequence
@@ -49,7 +50,7 @@ def train(path: str | Path, cache: Path, *, frames: tuple[int, int] | None = Non
         path,
         names=held.names,
         frames=[tuple((str(place),) for place in pair) for pair in places],
-        read=lambda row: with_truth(held, row),
+        read=functools.partial(with_truth, held),
         files=[held.path, *sorted({place for pair in places for place in pair})],
     )
 

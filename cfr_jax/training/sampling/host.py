@@ -17,7 +17,7 @@ from cfr_jax.training.step import TrainState
 
 
 class HostDrawing:
-    """`config.train.workers` threads draw ahead, from sources of any kind."""
+    """`config.train.workers` threads or processes draw ahead, from sources of any kind."""
 
     def __init__(self, config: TrainingConfig, mixture: Mixture, mesh: Mesh):
         self._config, self._mixture, self._mesh = config, mixture, mesh
