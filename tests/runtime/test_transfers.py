@@ -118,6 +118,9 @@ def test_a_training_step_transfers_nothing(tmp_path):
     batch = batch_at(ShapeSource(read_corpus(path)), 0, samples.BATCH, sampling, seed=0)
     batch = devices.spread(batch, devices.make_mesh())
     with jax.numpy_dtype_promotion("standard"):
+        # a callback, as of `jax.debug`, would fetch without the guard's notice
+        program = train_step.lower(samples.fresh(), batch, recipe=samples.recipe()).as_text()
+        assert "stablehlo" in program and "callback" not in program
         state, _ = train_step(samples.fresh(), batch, recipe=samples.recipe())
 
         with no_transfers():
