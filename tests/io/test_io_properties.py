@@ -188,3 +188,39 @@ def test_coordinates_that_float32_would_deform_become_doubles(tmp_path):
     held = columns_in(tmp_path / "out.ply")
     assert held["x"].dtype == np.float64 and held["nx"].dtype == np.float32
     np.testing.assert_array_equal(read(tmp_path / "out.ply").points, far.points)
+
+
+def old_loadtxt(data, dtype, *, delimiter, usecols, quotechar, **more):
+    """What numpy before 2.4 does: it reads an integer via a float where it has to."""
+    table = np.genfromtxt(data, "U64", delimiter=delimiter)[:, list(usecols)]
+    made = np.zeros(len(table), dtype)
+    for k, name in enumerate(dtype.names):
+        values = np.char.strip(table[:, k], '"').astype("f8")
+        with np.errstate(invalid="ignore"):
+            made[name] = values.astype(dtype[name])
+    return made
+
+
+@pytest.mark.parametrize("delimiter", [" ", ",", ";", "\t"])
+@pytest.mark.parametrize("mark", ["", '"'])
+def test_a_column_is_integer_only_if_all_its_cells_are(delimiter, mark, tmp_path, monkeypatch):
+    cells = {
+        "x": ["1", "2.5", "3"],
+        "y": ["4", "-3e2", "5"],
+        "z": ["1", "2", "-3"],
+        "huge": ["1", "9" * 20, "2"],
+        "gap": ["1", "nan", "2"],
+        "count": ["7", "+8", "9"],
+    }
+    lines = [cells, *zip(*cells.values(), strict=True)]
+    text = [delimiter.join(f"{mark}{cell}{mark}" for cell in line) for line in lines]
+    (tmp_path / "a.csv").write_text("\n".join(text) + "\n")
+    monkeypatch.setattr(np, "loadtxt", old_loadtxt)
+
+    table = read(tmp_path / "a.csv", properties=True).table
+
+    read_back = dict(zip(table.names, table.values, strict=True))
+    kinds = {name: read_back[name].dtype.kind for name in cells}
+    assert kinds == {"x": "f", "y": "f", "z": "i", "huge": "f", "gap": "f", "count": "i"}
+    for name, texts in cells.items():
+        np.testing.assert_array_equal(read_back[name], np.array(texts, float), err_msg=name)

@@ -16,6 +16,9 @@ from cfr_jax.io.formats.text.dialect import Layout
 from cfr_jax.io.formats.text.lines import bad_line, block_end, without_comments
 
 _CANNOT = re.compile(r"could not convert string .* at row \d+, column (\d+)")
+_MARKS = ".eEnN"  # one of them is in every number that is not an integer: 1.5, 1e3, nan, inf
+_IS_MARK = np.isin(np.arange(256), [ord(mark) for mark in _MARKS])
+_ENDS = (np.iinfo(np.int64).min, np.iinfo(np.int64).max)  # what too large an integer becomes
 
 
 def read_numbers(
@@ -57,6 +60,11 @@ def read_columns(data: bytes, layout: Layout) -> list[np.ndarray]:
 
 def _typed(block: bytes, line: int, layout: Layout, kinds: list[str]) -> list[np.ndarray]:
     """The columns of a block; `kinds` are widened where they do not hold what comes."""
+    if "i8" in kinds:
+        # not left to numpy's parser: before 2.4 it reads 3.7 as the integer 3
+        for column in _not_integers(block, line, layout):
+            if kinds[column] == "i8":
+                kinds[column] = "f8"
     while True:
         chosen = tuple(k for k, kind in enumerate(kinds) if kind != "U")
         found: dict[int, np.ndarray] = {}
@@ -68,6 +76,10 @@ def _typed(block: bytes, line: int, layout: Layout, kinds: list[str]) -> list[np
                 kinds[unfit.column] = "f8" if kinds[unfit.column] == "i8" else "U"
                 continue
             found = {k: rows[f"f{k}"] for k in chosen}
+            too_large = [k for k in chosen if kinds[k] == "i8" and np.isin(found[k], _ENDS).any()]
+            if too_large:
+                kinds[too_large[0]] = "f8"
+                continue
         words = [k for k, kind in enumerate(kinds) if kind == "U"]
         if words:
             cells = _cells(block, line, layout)
@@ -75,6 +87,30 @@ def _typed(block: bytes, line: int, layout: Layout, kinds: list[str]) -> list[np
         if len({len(values) for values in found.values()}) > 1:
             raise _uneven(line)
         return [found[k] for k in range(len(kinds))]
+
+
+def _not_integers(block: bytes, line: int, layout: Layout) -> list[int]:
+    """The columns in which a cell has a mark of a number that is not an integer."""
+    raw = np.frombuffer(block, np.uint8)
+    marks = np.flatnonzero(_IS_MARK[raw])
+    if not len(marks):
+        return []
+    if layout.quoted:  # a cell may hold delimiters
+        rows = _cells(block, line, layout)
+        return [k for k in range(layout.width) if any({*_MARKS} & {*row[k]} for row in rows)]
+    if layout.delimiter is None:
+        filled = raw > 32
+        begins = filled.copy()
+        begins[1:] &= ~filled[:-1]
+        cells = np.cumsum(begins) - 1
+    else:
+        cells = np.cumsum(raw == ord(layout.delimiter))
+    # the cell before a row's first; `cells` has counted those of all rows before
+    ends = np.concatenate([[-1], np.flatnonzero(raw == 10)])
+    before = ends[np.searchsorted(ends, marks) - 1]
+    first = np.where(before < 0, 0, cells[before] + (layout.delimiter is None))
+    columns = np.unique(cells[marks] - first)
+    return columns[columns < layout.width].tolist()
 
 
 def _cells(block: bytes, line: int, layout: Layout) -> list[list[str]]:
