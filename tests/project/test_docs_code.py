@@ -34,7 +34,7 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
     "optional-dependencies"
 ]
 # Commands that are parsed and not run: they need what a test does not have, or take too long.
-ONLY_PARSED = {"data", "convert", "reproduce", "completion"}
+ONLY_PARSED = {"data", "calibrate", "convert", "reproduce", "completion"}
 # Blocks marked `not run`, by page: whoever adds one has to say so here.
 LEFT_OUT = {"files.md": 1, "gallery.md": 10, "recipes.md": 1, "notebooks.md": 1}
 
@@ -89,12 +89,15 @@ def samples(tmp_path) -> Path:
     """A folder with the files that the pages speak of."""
     shutil.copy(DEMO / "source.ply", tmp_path / "source.ply")
     io.write(tmp_path / "target.pcd", io.read(DEMO / "target.ply"))
-    # what the README calls them
+    # what pages call them
     for own, called in (("source.ply", "a.ply"), ("target.pcd", "b.pcd")):
         shutil.copy(tmp_path / own, tmp_path / called)
+    for own, called in (("target.ply", "b.ply"), ("source.ply", "c.ply")):
+        shutil.copy(DEMO / own, tmp_path / called)
     (tmp_path / "pairs.csv").write_text("source.ply,target.pcd\na.ply,b.pcd\n")
     (tmp_path / "scans").mkdir()
-    shutil.copy(DEMO / "source.ply", tmp_path / "scans" / "one.ply")
+    for own, called in (("source.ply", "one.ply"), ("target.ply", "two.ply")):
+        shutil.copy(DEMO / own, tmp_path / "scans" / called)
     return tmp_path
 
 
@@ -223,13 +226,15 @@ def test_every_command_of_a_page_names_what_there_is(name):
 def names_what_there_is(command: list[str]) -> bool:
     words = [word for word in command if "=" not in word or word.startswith("-")]
     match words:
-        case ["cfr", "--help" | "--version" | "COMMAND", *_]:
+        case [] | ["cfr", "--help" | "--version" | "COMMAND", *_]:
             return True
         case ["cfr", *rest]:
             return parses(rest)
         case ["make", *targets]:
             known = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
             return set(targets) <= set(known)
+        case ["pip", "download", *_]:
+            return True
         case ["pip", "install", *what]:
             ours = [word for word in what if word.startswith((".", "cfr_jax"))]
             extras = re.findall(r"[\w-]+", " ".join(re.findall(r"\[(.*?)\]", " ".join(ours))))
@@ -243,6 +248,8 @@ def names_what_there_is(command: list[str]) -> bool:
         case ["apt-get", "download", package]:  # of those that the corpus is made from
             makers = (ROOT / "cfr_jax/data/making").rglob("*.py")
             return any(package in maker.read_text("utf-8") for maker in makers)
+        case ["curl" | "mkdir" | "take" | "tar" | "}", *_] | ["take()", "{"]:
+            return True  # of the system, and a function that a page defines of them
         case ["jupyter", "lab", file]:
             return (ROOT / file).is_file()
         case _:

@@ -69,7 +69,7 @@ def test_ctrl_c_saves_and_the_same_command_goes_on(tmp_path):
 
     process = started()
     for line in process.stdout:
-        if line.startswith("going on"):
+        if line.startswith("resuming"):
             break
     process.kill()
     process.communicate()

@@ -28,7 +28,11 @@ def cloud_by_cloud(on_cpu: Callable, elsewhere: Callable) -> Callable:
         return lax.platform_dependent(*arguments, cpu=on_cpu, default=elsewhere)
 
     @mapped.def_vmap
-    def batch(size: int, batched: Any, *arguments: Any) -> tuple[Any, Any]:
+    def batch(
+        size: Any,  # a number, or a symbol in a program exported for any number
+        batched: Any,
+        *arguments: Any,
+    ) -> tuple[Any, Any]:
         axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
         leaves, structure = jax.tree.flatten(arguments)
         flags = jax.tree.leaves(batched)
