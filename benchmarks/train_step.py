@@ -143,7 +143,7 @@ def by_top_k(points, count, radius):
     return jnp.where(-near <= radius**2, found, found[:, :1]).astype(jnp.int32)
 
 
-def plain_features(layers, raw, *, groups, mask=None, columns=None):
+def plain_features(layers, raw, *, groups, mask=None, columns=None, activations="float32"):
     """`extraction.pooled_features` written out."""
     n, k, _ = raw.shape
     x = raw.reshape(n * k, -1)
