@@ -22,7 +22,13 @@ import pytest
 from amplifiers import makers
 from io_samples import write_las
 from mutants import mutate_part
-from test_io_budget import excesses, in_a_fork, read_and_measure, read_quietly
+from test_io_budget import (
+    excesses,
+    in_a_fork,
+    know_formats_of_corpora,
+    read_and_measure,
+    read_quietly,
+)
 
 LARGEST = 50_000_000
 EACH = 8  # of the mutants are made from one file
@@ -71,6 +77,7 @@ def _damage_and_read(path: Path, data: bytes, seed: str) -> dict:
 
 def run_cases(cases: int, seed: int) -> dict:
     """Reads that many damaged files, and tells what was wrong about how that went."""
+    know_formats_of_corpora()
     warnings.simplefilter("ignore")
     costs: dict[str, dict] = {}
     names = list(all_makers())
