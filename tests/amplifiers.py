@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Callable
 
 import numpy as np
+from amplifying_games import game_makers
 from amplifying_meshes import mesh_makers
 from kind_samples import npy
 
@@ -54,6 +55,7 @@ def makers() -> dict[str, Maker]:
         "wide line.laz": lambda size, rng: laz(size, rng, extra=rng.choice((2, 8))),
         "short rows.las": las,
         **mesh_makers(),
+        **game_makers(),
         "scan.bin": lambda size, rng: np.ones((size // 16, 4), "<f4").tobytes(),
     }  # fmt: skip
 

@@ -26,6 +26,8 @@ STRANGE = (
     [[1, 0, 0, 0]] * 4, {"a": 1}, {"": {}}, *(raw.strip('"') for raw in _RAW),
 )  # fmt: skip
 
+_PART = 1 << 16  # bytes
+
 
 def mutate(data: bytes, generator: random.Random) -> bytes:
     """One to three damages, more of them in the first bytes, where headers are."""
@@ -64,6 +66,15 @@ def mutate(data: bytes, generator: random.Random) -> bytes:
         else:  # counts and lengths just beyond what is there
             damaged[at : at + 4] = (generator.choice((size, 50_000, 1 << 24))).to_bytes(4, "little")
     return bytes(damaged)
+
+
+def mutate_part(data: bytes, generator: random.Random) -> bytes:
+    """As `mutate`, within 64 KB at the start, at the end, or anywhere: for large files."""
+    if generator.random() < 0.1:
+        return data[: generator.randrange(len(data))]
+    last = max(len(data) - _PART, 0)
+    at = generator.choice((0, 0, last, generator.randrange(last + 1)))
+    return data[:at] + mutate(data[at : at + _PART], generator) + data[at + _PART :]
 
 
 def mutate_json(value: Any, generator: random.Random) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -258,6 +259,36 @@ def test_a_kill_loses_nothing_and_no_pair_is_done_twice(tmp_path, quick):
     names = [line["source"] for line in lines(kept)[1:]]
     assert sorted(names) == sorted({f"s{i}.ply" for i in range(40)})
     assert len(table(tmp_path / "results.csv")) == 40
+
+
+@pytest.mark.slow
+def test_thirty_kills_at_random_moments_leave_the_same_bytes(tmp_path):
+    # given a batch that nothing disturbed
+    listed = batch_samples.write_pairs(tmp_path, 200)
+    command = [sys.executable, "-c", _SLOW.replace("0.3", "0.05"), str(TESTS), "batch", str(listed)]
+    assert run(listed, out="whole.csv") == 0
+
+    # when another one is killed again and again, each time after some more pairs
+    chance, kept = random.Random(0), tmp_path / "killed.jsonl"
+    for kill in range(30):
+        before = kept.stat().st_size if kept.exists() else 0
+        child = subprocess.Popen(
+            [*command, "--out", str(tmp_path / "killed.csv")],
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        deadline = time.monotonic() + 120
+        while not (kept.exists() and kept.stat().st_size > before):
+            assert time.monotonic() < deadline and child.poll() is None, (kill, child.communicate())
+            time.sleep(0.01)
+        time.sleep(chance.uniform(0, 0.1))
+        child.kill()
+        child.communicate()
+    assert not (tmp_path / "killed.csv").exists(), "killed too late to tell"
+    assert run(listed, out="killed.csv") == 0
+
+    # then
+    assert (tmp_path / "killed.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
+    assert len(lines(kept)) == 1 + 200
 
 
 def test_columns_are_named_once():

@@ -4,9 +4,10 @@ import mesh_samples as samples
 import numpy as np
 import pytest
 
+from cfr_jax.data.making.ac3d import parse_ac3d
 from cfr_jax.data.making.furniture import CATALOG, FurnitureLibrary
 from cfr_jax.data.making.mesh_formats import mesh_formats
-from cfr_jax.data.making.meshes import parse_ac3d, parse_pmd, read_mesh
+from cfr_jax.data.making.meshes import parse_pmd, read_mesh
 from cfr_jax.io.formats import by_suffix
 
 KNOT = samples.knot(0)
@@ -41,6 +42,7 @@ def test_pmd_faces_are_wound_to_agree_with_the_normals_of_their_vertices():
         (lambda data: data[:4] + b"\3" + data[5:], "version 3"),
         (lambda data: data[:500], "ends within its 30 vertices"),
         (lambda data: data[:-30], "ends within its .* faces"),
+        (lambda data: data[:16] + b"\xff\xff\xff\xff" + data[20:], "ends within its 30 vertices"),
         (lambda data: data[:-14] + b"\xff\xff" + data[-12:], "names vertex 65535 of 30"),
     ],
 )
@@ -122,11 +124,18 @@ def test_ac3d_may_declare_more_children_than_it_has():
     "old, new, message",
     [
         ("AC3Db", "AC4D", "wanted 'AC3D'"),
-        ("1 0 0 0.5 0.5", "1 0", "line 16: wanted 3 numbers"),
-        ("refs 4", "refs -4", "line 22: wanted a count"),
+        ("1 0 0 0.5 0.5", "1 0", "line 16: wanted 3 numbers, got 2"),
+        ("refs 4", "refs -4", "line 20: wanted SURF, mat and refs"),
+        ("SURF 0x20", "SURF 2x0", "line 20: wanted the flags of a surface"),
+        ("loc 0 0 5", "loc 0 0 e", "line 13: wanted 3 numbers, got '0 0 e'"),
+        ("numvert 4", "numvert 9", "line 19: they end after 4 of 9 vertices"),
         ("3 0 0\nSURF 0x22", "4 0 0\nSURF 0x22", "line 26: a surface names vertex 4 of 4"),
         ("2 0 0\nkids 0\nOBJECT poly", "2 0 0\nOBJECT poly", "wanted 'kids' before"),
-        ("refs 3\n0 0 0\n1 0 0\n2 0 0\nkids 0\n", "refs 9\n0 0 0\n", "wanted a count"),
+        (
+            "refs 3\n0 0 0\n1 0 0\n2 0 0\nkids 0\n",
+            "refs 9\n0 0 0\n",
+            "wanted the index of a corner",
+        ),
         ("kids 2", "kids 2\njunk", "wanted OBJECT or MATERIAL, got 'junk'"),
     ],
 )

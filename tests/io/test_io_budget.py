@@ -49,7 +49,7 @@ def _make(path: Path, name: str, size: int, seed: str) -> dict:
     return {"size": path.stat().st_size}
 
 
-def _read(path: Path, whole: bool) -> dict:
+def read_and_measure(path: Path, whole: bool) -> dict:
     from cfr_jax.io import CloudFileError, read
 
     resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_SPACE, _ADDRESS_SPACE))
@@ -66,8 +66,19 @@ def _read(path: Path, whole: bool) -> dict:
     return {"seconds": seconds, "bytes": memory("VmHWM") - before, "error": error}
 
 
+def know_formats_of_corpora() -> None:
+    """Lets this process read what only corpora are made of as any other file."""
+    from cfr_jax.data.making.mesh_formats import mesh_formats
+    from cfr_jax.io import formats
+
+    for form in mesh_formats():
+        if form not in formats.entries():
+            formats.add(form)
+
+
 def run_cases(size: int, seeds: int, names: list[str]) -> dict[str, dict]:
     """The cost of each kind of file with each seed, bare and with all properties."""
+    know_formats_of_corpora()
     warnings.simplefilter("ignore")
     costs = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -75,17 +86,19 @@ def run_cases(size: int, seeds: int, names: list[str]) -> dict[str, dict]:
             warm = Path(folder) / f"small {name}"
             in_a_fork(_make, warm, name, 3_000, name)
             for whole in (False, True):  # what is loaded only once is no cost of a file
-                _read_quietly(warm, whole)
+                read_quietly(warm, whole)
             for seed in range(seeds):
                 path = Path(folder) / name
                 made = in_a_fork(_make, path, name, size, f"{name} {seed}")
                 for whole in (False, True):
-                    costs[f"{name}, {seed}, {whole}"] = made | in_a_fork(_read, path, whole)
+                    costs[f"{name}, {seed}, {whole}"] = made | in_a_fork(
+                        read_and_measure, path, whole
+                    )
                 path.unlink()
     return costs
 
 
-def _read_quietly(path: Path, whole: bool) -> None:
+def read_quietly(path: Path, whole: bool) -> None:
     from cfr_jax.io import CloudFileError, read
 
     if path.stat().st_size > 100_000:

@@ -26,9 +26,9 @@ PLY = "ply\nformat ascii 1.0\nelement vertex {n}\n" + "".join(
 FACES = "element face {n}\nproperty list uchar int vertex_indices\n"
 
 
-def refusal(path) -> str:
+def refusal(path, **options) -> str:
     with pytest.raises(CloudFileError) as caught:
-        read(path)
+        read(path, **options)
     message = str(caught.value)
     assert message.startswith(f"{path}: ") and "\n" not in message
     return message.removeprefix(f"{path}: ")
@@ -108,6 +108,8 @@ def test_an_unknown_suffix_is_answered_with_the_known_ones(tmp_path):
         ),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex x\nend_header\n", "line 3"),
         ("a.xyz", "1 2 3\n4 5\n", "line 2: .*columns changed"),
+        ("a.xyz", "1 2 3\n4.5 5 x\n", "line 2: could not convert string 'x'"),
+        ("a.csv", "x,y,z,label\n1,2,3,a\n4,x,6,b\n", "line 3: could not convert string 'x'"),
         ("a.xyz", "# c\n\n1 2 3\n4 1e13 6\n", "point 1"),
         ("a.xyz", "1 2\n3 4\n", "rows of x, y, z"),
         ("a.csv", "x,y,z\n1,,3\n", "line 2"),
@@ -133,9 +135,10 @@ def test_an_unknown_suffix_is_answered_with_the_known_ones(tmp_path):
         ("a.stl", "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n", "line 2: .*facet"),
     ],
 )
-def test_the_message_names_place_and_want(name, text, told, tmp_path):
+@pytest.mark.parametrize("properties", [False, True])
+def test_the_message_names_place_and_want(name, text, told, properties, tmp_path):
     (tmp_path / name).write_text(text)
-    assert re.search(told, refusal(tmp_path / name))
+    assert re.search(told, refusal(tmp_path / name, properties=properties))
 
 
 def test_headers_that_promise_more_than_the_file_holds_are_refused_at_once(tmp_path):

@@ -19,7 +19,7 @@ from cfr_jax.training.config import Phase
 from cfr_jax.weights.files import load_params
 
 HERE = Path(__file__).parent
-KILLS = 4
+KILLS = 15
 
 
 def start(given, workdir):

@@ -1,18 +1,15 @@
-"""Formats that corpora are made from: all surface formats of the table, and two formats of games.
-
-These two are read only to build corpora: their parsers refuse damaged files, but keep no budget of
-memory and time, as `cfr_jax.io` does.
-"""
+"""Formats that corpora are made from: all surface formats of the table, and two formats of games,
+which are read only to build corpora."""
 
 from __future__ import annotations
 
 from cfr_jax.io import formats
 from cfr_jax.io.formats import Format, later
 
-_MESHES = "cfr_jax.data.making.meshes"
+_HERE = "cfr_jax.data.making"
 _GAMES = (
-    Format("PMD", (".pmd",), "surface", later(_MESHES, "parse_pmd")),
-    Format("AC3D", (".ac",), "surface", later(_MESHES, "parse_ac3d")),
+    Format("PMD", (".pmd",), "surface", later(f"{_HERE}.meshes", "parse_pmd")),
+    Format("AC3D", (".ac",), "surface", later(f"{_HERE}.ac3d", "parse_ac3d")),
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float64
@@ -41,13 +41,16 @@ def read_numbers(
     return table[:done]
 
 
-def read_columns(data: bytes, layout: Layout) -> list[np.ndarray]:
-    """All columns, each in the narrowest type of int64, float64 and text that holds it."""
+def read_columns(data: bytes, layout: Layout, numbers: Sequence[int]) -> list[np.ndarray]:
+    """All columns, each in the narrowest type of int64, float64 and text that holds it.
+
+    Raises CloudFileError where a column of `numbers` holds something else.
+    """
     kinds = ["i8"] * layout.width
     parts: list[list[np.ndarray]] = [[] for _ in kinds]
     taken = 0
     for line, block in blocks(data, layout):
-        for column, part in enumerate(_typed(block, line, layout, kinds)):
+        for column, part in enumerate(_typed(block, line, layout, kinds, numbers)):
             parts[column].append(part)
             taken += part.nbytes + 8 * len(part) * (column < 3)  # and as points
         check_room(taken, 1, len(data), "bytes of columns and more")
@@ -58,7 +61,9 @@ def read_columns(data: bytes, layout: Layout) -> list[np.ndarray]:
     return columns
 
 
-def _typed(block: bytes, line: int, layout: Layout, kinds: list[str]) -> list[np.ndarray]:
+def _typed(
+    block: bytes, line: int, layout: Layout, kinds: list[str], numbers: Sequence[int]
+) -> list[np.ndarray]:
     """The columns of a block; `kinds` are widened where they do not hold what comes."""
     if "i8" in kinds:
         # not left to numpy's parser: before 2.4 it reads 3.7 as the integer 3
@@ -73,6 +78,9 @@ def _typed(block: bytes, line: int, layout: Layout, kinds: list[str]) -> list[np
             try:
                 rows = _load(block, line, layout, chosen, dtype)
             except _Unfit as unfit:
+                if kinds[unfit.column] == "f8" and unfit.column in numbers:
+                    where = line + bad_line(block, layout.delimiter, (unfit.column,))
+                    raise CloudFileError(f"line {where}: {unfit}") from None
                 kinds[unfit.column] = "f8" if kinds[unfit.column] == "i8" else "U"
                 continue
             found = {k: rows[f"f{k}"] for k in chosen}
@@ -132,8 +140,8 @@ def _cells(block: bytes, line: int, layout: Layout) -> list[list[str]]:
 class _Unfit(ValueError):
     """A cell that its column's type does not hold."""
 
-    def __init__(self, column: int) -> None:
-        super().__init__()
+    def __init__(self, column: int, told: str) -> None:
+        super().__init__(told)
         self.column = column
 
 
@@ -184,7 +192,7 @@ def _load(
     except ValueError as error:
         told = _CANNOT.search(str(error))
         if dtype.names and told is not None:
-            raise _Unfit(int(told[1]) - 1) from None
+            raise _Unfit(int(told[1]) - 1, str(error)) from None
         where = line + bad_line(block, layout.delimiter, columns)
         raise CloudFileError(f"line {where}: {error}") from None
 

@@ -192,7 +192,7 @@ def ragged(block: bytes, line: int) -> Ragged:
     try:
         values = _numbers(block.translate(_BLANKS_TO_NEWLINES))[:, 0]
     except ValueError as error:
-        where = line + bad_line(block, None, (0,))
+        where = line + bad_line(block, None, uneven=True)
         raise CloudFileError(f"line {where}: {error}") from None
     filled = np.frombuffer(block, np.uint8) > 32
     begins = filled.copy()
@@ -207,7 +207,7 @@ def _load(block: bytes, line: int) -> Float64[np.ndarray, "n c"]:
     try:
         return _numbers(block)
     except ValueError as error:
-        where = line + bad_line(block, None, None)
+        where = line + bad_line(block, None)
         raise CloudFileError(f"line {where}: {error}") from None
 
 
@@ -215,22 +215,31 @@ def _numbers(block: bytes) -> Float64[np.ndarray, "n c"]:
     return np.loadtxt(io.BytesIO(block), comments=None, ndmin=2, encoding="latin1")
 
 
-def bad_line(data: bytes, delimiter: str | None, columns: tuple[int, ...] | None) -> int:
-    """Index of the line numpy stumbled over; numpy itself counts without the blank ones."""
+def bad_line(
+    data: bytes,
+    delimiter: str | None,
+    columns: tuple[int, ...] | None = None,
+    *,
+    uneven: bool = False,
+) -> int:
+    """Index of the line numpy stumbled over; numpy itself counts without the blank ones.
+
+    Only the `columns` were read, or all of them, and then as many in each line unless `uneven`.
+    """
     separator = None if delimiter is None else delimiter.encode()
     width = None
     for index, line in enumerate(data.split(b"\n")):
         cells = line.split(separator)
         if not line.strip():
             continue
-        try:
-            for cell in cells:
-                float(cell.replace(b"_", b"?"))  # Python allows 1_000, numpy does not
-        except ValueError:
-            return index
-        if columns is None and width not in (None, len(cells)):
+        if columns is None and not uneven and width not in (None, len(cells)):
             return index
         if columns is not None and len(cells) <= max(columns):
+            return index
+        try:
+            for cell in cells if columns is None else (cells[column] for column in columns):
+                float(cell.replace(b"_", b"?"))  # Python allows 1_000, numpy does not
+        except ValueError:
             return index
         width = len(cells)
     return 0

@@ -94,20 +94,13 @@ def _whole(
     text: bytes, layout: Layout, names: tuple[str, ...] | None, named: bool
 ) -> tuple[Table, tuple[str, ...]]:
     """The table with every column."""
-    values = read_columns(text, layout)
     if names is not None:
         roles = roles_of(names)
-        _check_numbers([values[k] for k in (*roles.points, *roles.normals)])
+        values = read_columns(text, layout, (*roles.points, *roles.normals))
         return Table(names, tuple(values), roles, named, format=FORMAT), ()
-    values = values[layout.skipped :]
-    _check_numbers(values[:6])
-    return unnamed_table(values, format=FORMAT)
-
-
-def _check_numbers(columns: list) -> None:
-    for values in columns:
-        if values.dtype.kind == "U":
-            raise CloudFileError(f"wanted numbers, got {values[0]!r:.40} and the like")
+    first = layout.skipped
+    values = read_columns(text, layout, range(first, first + 6))
+    return unnamed_table(values[first:], format=FORMAT)
 
 
 def _judged(values: list, width: int) -> tuple[Roles, tuple[str, ...]]:
