@@ -261,4 +261,4 @@ def test_a_kill_loses_nothing_and_no_pair_is_done_twice(tmp_path, quick):
 
 
 def test_columns_are_named_once():
-    assert len(set(records.COLUMNS)) == len(records.COLUMNS) == 26
+    assert len(set(records.COLUMNS)) == len(records.COLUMNS) == 28
