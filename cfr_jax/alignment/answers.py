@@ -83,8 +83,8 @@ class Alignment(ByValue):
     """What the points of the source were multiplied by: 1, the number that the caller gave, or, for
     `scale="auto"`, the factor that was estimated."""
     scale_confidence: float | None = None
-    """The estimated probability, in [0, 1], that an estimated `scale` is right to 2 percent. None
-    if it was not estimated."""
+    """The estimated probability, in [0, 1], that an estimated `scale` is right to 2 percent, if the
+    motion is right. None if it was not estimated."""
 
     _not_compared = ("seconds",)
 

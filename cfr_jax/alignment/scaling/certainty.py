@@ -42,7 +42,7 @@ class Certainty(NamedTuple):
     center: Float[np.ndarray, " 3"]
 
     def confidence(self, spread: float) -> float:
-        """The probability that the factor is right to 2 percent.
+        """The probability that the factor is right to 2 percent, if the motion is right.
 
         `spread` is how far apart, in the log of the factor, refinements end that start from smaller
         and larger factors.
