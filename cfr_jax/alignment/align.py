@@ -10,8 +10,9 @@ from typing import Any
 from cfr_jax.alignment import confidence
 from cfr_jax.alignment.answers import Alignment, answer
 from cfr_jax.alignment.case import Case
-from cfr_jax.alignment.planning import Initial, Plan, planned
+from cfr_jax.alignment.planning import Initial, Plan
 from cfr_jax.alignment.refining import refine_every_point, refine_used_points
+from cfr_jax.alignment.scaling.planning import Scale, planned_at_scale
 from cfr_jax.alignment.search import search
 from cfr_jax.alignment.second_look import keep_start, look_again, look_everywhere
 from cfr_jax.alignment.solving import on_accelerator, solve_case
@@ -34,14 +35,17 @@ def align(
     max_points: int | None = None,
     all_points: bool = True,
     second_look: bool = True,
+    scale: Scale = 1.0,
     seed: int = 0,
 ) -> Alignment:
     """Finds the rigid motion that moves `source` onto `target`.
 
-    The clouds may have any size and offset, and any unit that is the same for both. They are
-    centered and scaled in float64, and thinned. The network registers them in two cascades, and a
-    local refinement makes its answer precise. The same call gives the same answer, bit by bit, on
-    the same machine. There is no gradient; `register` has one.
+    The clouds may have any size and offset, and any unit that is the same for both; for different
+    units, see `scale`. They are centered and scaled in float64, and thinned. The network registers
+    them in two cascades, and a local refinement makes its answer precise. The same call gives the
+    same answer, bit by bit, on the same machine. There is no gradient, of the motion or of an
+    estimated scale; `register` has one, also with regard to a factor that its source is multiplied
+    by.
 
     Args:
         source: The cloud that moves: an (n, 3) array, an (n, 6) array with normals, a path, or
@@ -68,30 +72,41 @@ def align(
             starts: the identity, and rotations around the first start. The one that is more likely
             right is kept. Without effect if `initial` is given, or if the weights have no
             calibration, which tells the better answer.
+        scale: What the points of the source are multiplied by before anything else.
+            A number: for example 0.001 if the source is in millimeters and the target in meters.
+            "auto": the factor is estimated. This takes about four times as long. The answer is
+            trusted only if the shapes determine the factor: planes, cones, or the corner of a room
+            do not, and two cubes of different size are taken for one. `initial` may then be no
+            array, because it moves the scaled source.
         seed: Which points are kept when a cloud is thinned.
 
     Returns:
         An `Alignment`. Read `transform` (4, 4), `trusted` and `warnings` first. The transform maps
-        source onto target, in the unit and the frames of the clouds: `T @ [x; 1]`.
+        source onto target, in the unit and the frames of the clouds: `T @ [x; 1]`. It is rigid with
+        any `scale`, and maps the scaled source; `similarity` (4, 4) includes the scale.
 
     Raises:
         ValueError: A cloud has no extent or fewer than 3 points. A shape is wrong. A value is not
-            finite. `initial` is not a rigid motion, or leaves the clouds far apart.
+            finite. `initial` is not a rigid motion, or leaves the clouds far apart. `scale` is not
+            a positive number or "auto".
         CloudFileError: A file cannot be read.
         ModuleNotFoundError: The library that `refine` needs is missing.
     """
     began = time.perf_counter()
     refinements = chosen_refinements(refine, all_points=all_points)
-    plan = planned(
+    weights = checked_params(params)
+    plan = planned_at_scale(
+        weights,
         source,
         target,
+        scale=scale,
         initial=initial,
         max_points=max_points,
         seed=seed,
         whole=any(each.every_point for each in refinements),
         search=not on_accelerator(),
     )
-    case = Case(checked_params(params), plan)
+    case = Case(weights, plan)
     for step in steps(plan, refinements, second_look=second_look):
         case = step(case)
     case.seconds["total"] = time.perf_counter() - began

@@ -28,7 +28,9 @@ class Alignment(ByValue):
     """
 
     transform: Float[np.ndarray, "4 4"]
-    """Maps source onto target: `transform @ [x; 1]` lies on the target. Float64."""
+    """Maps source onto target: `transform @ [x; 1]` lies on the target. Float64. With a `scale`
+    other than 1, it is still rigid, and maps the scaled source: `transform @ [scale * x; 1]`. So do
+    all other motions here."""
     transforms: Float[np.ndarray, "L 4 4"]
     """The network's answers before any refinement, one per iteration of its two cascades."""
     refined: bool
@@ -77,13 +79,29 @@ class Alignment(ByValue):
     """Other motions that fit about as well or better. They were found by a search or, if the answer
     would be trusted, by turning it far. If there are any, the shape is nearly symmetric."""
 
+    scale: float = 1.0
+    """What the points of the source were multiplied by: 1, the number that the caller gave, or, for
+    `scale="auto"`, the factor that was estimated."""
+    scale_confidence: float | None = None
+    """The estimated probability, in [0, 1], that an estimated `scale` is right to 2 percent, if the
+    motion is right. None if it was not estimated."""
+
     _not_compared = ("seconds",)
+
+    @property
+    def similarity(self) -> Float[np.ndarray, "4 4"]:
+        """Maps source onto target with its scale: `similarity @ [x; 1]` lies on the target. Equal
+        to `transform` if `scale` is 1."""
+        return self.transform @ np.diag([self.scale, self.scale, self.scale, 1.0])
 
     @property
     def trusted(self) -> bool:
         """Whether the clouds determine the motion and it is more likely right than wrong. False if
-        the confidence is unknown, or if `alternatives` fit about as well."""
+        the confidence is unknown, if `alternatives` fit about as well, or if the scale was
+        estimated and is in doubt."""
         if self.confidence is None or len(self.alternatives):
+            return False
+        if self.scale_confidence is not None and not doubts.trusted(self.scale_confidence):
             return False
         return self.determined and doubts.trusted(self.confidence)
 
@@ -102,7 +120,7 @@ class Alignment(ByValue):
                 'to_open3d needs Open3D: pip install "cfr_jax[baselines]"', name="open3d"
             ) from error
         result = RegistrationResult()
-        result.transformation = self.transform
+        result.transformation = self.similarity
         result.fitness, result.inlier_rmse = self.fitness, self.inlier_rmse
         return result
 
@@ -157,7 +175,11 @@ def answer(case: Case) -> Alignment:
             frames.size_ratio,
             far is not None,
             plan.remarks,
-        ),
+            plan.spacing_ratio,
+        )
+        + doubts.of_scale(plan.scale_confidence),
+        scale=plan.scale,
+        scale_confidence=plan.scale_confidence,
         seconds=case.seconds,
         initial=initial,
         starts=1 if searched is None else searched.starts,

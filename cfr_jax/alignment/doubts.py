@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from cfr_jax.alignment import confidence
-from cfr_jax.alignment.planning import SETTINGS
+from cfr_jax.alignment.planning import SETTINGS, SIZES_APART
+from cfr_jax.alignment.scaling import ratios
 from cfr_jax.geometry import motions
 from cfr_jax.networks.probability import Calibration
 
@@ -21,11 +22,9 @@ FREE = 0.08
 TRUSTED = 0.5
 _HARDLY = 0.2  # with less of the source on the target, nobody can say what the shapes determine
 _INLIERS = 30.0  # 21 inliers allow a confidence of 0.5, and a hundred allow 0.96
-# How many of each unit make a meter.
-_PER_METER = {"millimeters": 1000.0, "centimeters": 100.0, "inches": 39.3701, "feet": 3.28084,
-              "meters": 1.0}  # fmt: skip
-_PARTS_APART = 2.0  # views of one thing may differ in radius by this factor, units differ by more
-_SIZES_APART = 5.0  # partial views of one thing never differ in radius by as much as this
+# Two views of one thing may differ in radius by the first factor, and two scans of it in the
+# spacing of their points by the second one. Most units differ by more.
+_PARTS_APART, _SPACINGS_APART = 2.0, 3.0
 
 
 def warnings_of(
@@ -37,6 +36,7 @@ def warnings_of(
     size_ratio: float,
     searched: bool,
     remarks: Sequence[str] = (),
+    spacing_ratio: float | None = None,
 ) -> tuple[str, ...]:
     """All warnings about an answer, in words.
 
@@ -44,14 +44,11 @@ def warnings_of(
     alternative motions differ from the answer (`turns`). `probability` is None if the weights have
     no calibration. `size_ratio` is the source's radius divided by the target's. `searched` tells
     whether starts far from the first were tried. `remarks` come first (`Plan.remarks`).
+    `spacing_ratio` is like `size_ratio`, for the distances between neighboring points, if known.
     """
     warnings = list(remarks)
-    if not 1 / _SIZES_APART < size_ratio < _SIZES_APART:
-        larger, smaller, times = "source", "target", size_ratio
-        if size_ratio < 1:
-            larger, smaller, times = "target", "source", 1 / size_ratio
-        told = f"the {larger} is {times:.3g} times as large as the {smaller}: same units?"
-        warnings.append(told + _units_in_words(size_ratio))
+    if told := _sizes_in_words(size_ratio, spacing_ratio):
+        warnings.append(told)
     if fitness < _HARDLY:
         warnings.append(f"the clouds hardly meet: {fitness:.0%} of the source lies on the target")
     elif free is not None:
@@ -107,19 +104,42 @@ def trusted(probability: float | None) -> bool:
     return probability is not None and probability >= TRUSTED
 
 
-def _units_in_words(size_ratio: float) -> str:
-    """A sentence that names the units of the two clouds, as guessed from their sizes, and the
-    factor that converts between them. Empty if no two common units explain the ratio."""
-    off, factor, ours, theirs = min(
-        (abs(math.log(size_ratio * theirs / ours)), theirs / ours, our_name, their_name)
-        for our_name, ours in _PER_METER.items()
-        for their_name, theirs in _PER_METER.items()
-    )
-    if off > math.log(_PARTS_APART):
-        return ""
+def of_scale(confidence: float | None) -> tuple[str, ...]:
+    """A warning if the factor of scale was estimated and may be wrong; None: it was not
+    estimated."""
+    if confidence is None or trusted(confidence):
+        return ()
     return (
-        f" If the source is in {ours} and the target in {theirs}, "
-        f"multiply the source by {factor:.4g}"
+        f"not to be trusted: the clouds leave the factor of scale open (confidence "
+        f"{confidence:.2f}); give the factor if you know it",
+    )
+
+
+def _sizes_in_words(size_ratio: float, spacing_ratio: float | None) -> str:
+    """What is remarkable about the sizes of the two clouds. Empty if they are similar.
+
+    If the units differ, the sizes and the spacings of the points differ by the same factor. If only
+    the sizes differ, then one cloud is a part of the other.
+    """
+    if 1 / SIZES_APART <= size_ratio <= SIZES_APART:
+        return ""
+    larger, smaller, times = "source", "target", size_ratio
+    if size_ratio < 1:
+        larger, smaller, times = "target", "source", 1 / size_ratio
+    told = f"the {larger} is {times:.3g} times as large as the {smaller}"
+    unit = ratios.nearest(1 / size_ratio)
+    fits = abs(math.log(size_ratio * unit.factor)) <= math.log(_PARTS_APART)
+    if spacing_ratio is not None:
+        same = abs(math.log(spacing_ratio))
+        if same <= math.log(_SPACINGS_APART):
+            return f"{told}, with points as dense: if it shows much more, cut the rest off"
+        fits = fits and abs(math.log(spacing_ratio * unit.factor)) <= math.log(_SPACINGS_APART)
+    told += ": same units?"
+    if not fits:
+        return told
+    return (
+        f"{told} If the source is in {unit.source} and the target in {unit.target}, "
+        f'multiply the source by {unit.factor:.4g} (scale={unit.factor:.4g}, or scale="auto")'
     )
 
 

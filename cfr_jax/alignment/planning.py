@@ -13,12 +13,14 @@ from jaxtyping import Float
 
 from cfr_jax.alignment import starts
 from cfr_jax.geometry import motions, plausible, thinning, units
+from cfr_jax.geometry.trees import Tree
 from cfr_jax.io import PointCloud, as_point_cloud
 from cfr_jax.networks.inputs import Settings, refuse_masked
 
 DEFAULT_BUDGET = 1024
 SETTINGS = Settings()
 _SAMPLED = 2048  # points that are looked at to find out whether many are repeated
+SIZES_APART = 5.0  # partial views of one thing never differ in radius by as much as this
 CASCADES = 2  # chosen on validation pairs (docs/training.md)
 
 # What the option `initial` of `align` takes.
@@ -45,6 +47,13 @@ class Plan:
     """The caller's clouds with all their points, if a refinement needs them."""
     remarks: tuple[str, ...] = ()
     """Sentences that say what was done differently when the clouds were prepared."""
+    spacing_ratio: float | None = None
+    """The distance between neighboring points of the source, divided by that of the target. Only
+    known where the sizes of the clouds differ much."""
+    scale: float = 1.0
+    """What the points of the caller's source were multiplied by."""
+    scale_confidence: float | None = None
+    """How likely that factor is right, if it was estimated."""
 
     @property
     def thinned(self) -> bool:
@@ -143,7 +152,15 @@ def planned(
         starts=several,
         whole=(_each_place_once(source), _each_place_once(target)) if whole else None,
         remarks=remarks,
+        spacing_ratio=_spacing_ratio(frames, source, target),
     )
+
+
+def _spacing_ratio(frames: units.Frames, source: PointCloud, target: PointCloud) -> float | None:
+    if 1 / SIZES_APART <= frames.size_ratio <= SIZES_APART:
+        return None
+    ours, theirs = Tree(source.points).spacing, Tree(target.points).spacing
+    return ours / theirs if ours > 0 and theirs > 0 else None
 
 
 def _without_wrong_normals(

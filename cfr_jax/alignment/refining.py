@@ -24,8 +24,7 @@ def refine_used_points(case: Case, *, refine: Refinement) -> Case:
     worse."""
     began = time.perf_counter()
     plan, found = case.plan, case.solved()
-    surfaces = _used(plan.source), _used(plan.target)
-    fit = refine(*surfaces, np.asarray(found.transform, np.float64))
+    fit = refine(*used_points(plan), np.asarray(found.transform, np.float64))
     case.seconds["run"] += time.perf_counter() - began
     sides = solving.on_device(plan.source, plan.target)
     told = np.asarray(fit.transform, np.float32), np.asarray(fit.converged)
@@ -81,7 +80,7 @@ def placed(case: Case) -> Case:
     if case.placed is not None:
         return case
     plan = case.plan
-    sides = (_used(plan.source), _used(plan.target)) if plan.whole is None else every_point(plan)
+    sides = used_points(plan) if plan.whole is None else every_point(plan)
     return dataclasses.replace(case, placed=Placed(*sides, plan.frames))
 
 
@@ -106,6 +105,11 @@ def _of_plan(case: Case, transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarra
     if case.placed.frames is case.plan.frames:
         return transform
     return case.plan.frames.to_unit(case.placed.frames.to_caller(transform))
+
+
+def used_points(plan: Plan) -> tuple[HostSurface, HostSurface]:
+    """The points of both clouds that the network sees."""
+    return _used(plan.source), _used(plan.target)
 
 
 def _used(unit: UnitCloud) -> HostSurface:

@@ -10,7 +10,8 @@ from cfr_jax.batch.jobs import Job
 from cfr_jax.batch.stream import Outcome
 from cfr_jax.runtime.messages import escaped
 
-_FIGURES = ("trusted", "confidence", "determined", "fitness", "inlier_rmse", "inlier_distance")
+_FIGURES = ("trusted", "confidence", "determined", "fitness", "inlier_rmse", "inlier_distance",
+            "scale", "scale_confidence")  # fmt: skip
 _CELLS = tuple(f"t{row}{column}" for row in range(4) for column in range(4))
 # The wide forms count as the others where texts are Chinese or Japanese.
 _RUN_BY_SPREADSHEETS = ("=", "+", "-", "@", "\n", "＝", "＋", "－", "＠")

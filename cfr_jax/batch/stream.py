@@ -11,7 +11,8 @@ from typing import Any
 
 from cfr_jax.alignment.align import checked_params, chosen_refinements
 from cfr_jax.alignment.answers import Alignment
-from cfr_jax.alignment.planning import DEFAULT_BUDGET, Plan, planned, whole_number
+from cfr_jax.alignment.planning import DEFAULT_BUDGET, Plan, whole_number
+from cfr_jax.alignment.scaling.planning import Scale, checked_scale, planned_at_scale
 from cfr_jax.alignment.solving import on_accelerator
 from cfr_jax.batch.device import Device, Signature, signature
 from cfr_jax.batch.memo import Memo
@@ -48,6 +49,7 @@ def align_many(
     max_points: int | None = None,
     all_points: bool = True,
     second_look: bool = True,
+    scale: Scale = 1.0,
     seed: int = 0,
     batch: int | None = None,
     workers: int | None = None,
@@ -68,7 +70,8 @@ def align_many(
     done. The answers equal those of `align` up to float32 rounding. A `second_look` and the last
     refinement, on `all_points`, run pair by pair. `refine` may name any refinement that JAX can
     trace. If a pair cannot be read or has no answer, its outcome has an `error`, and the others
-    continue. Do not change an array before its outcome has come.
+    continue. `scale` is that of `align`, for all pairs. Do not change an array before its outcome
+    has come.
 
     Raises ValueError for invalid options, before it reads any pair.
     """
@@ -87,16 +90,20 @@ def align_many(
             f"refine: got {refine!r}, which runs on the host; wanted True, False or one that JAX "
             "can trace. `align` takes any, pair by pair"
         )
+    checked_scale(scale, None)
     device = Device(weights, refinements, second_look, whole_number("batch", batch, least=1))
     workers = whole_number("workers", workers, least=1)
-    done = _done(_Planner(budget, seed, len(refinements) > 1), pairs, device, workers)
+    done = _done(
+        _Planner(weights, scale, budget, seed, len(refinements) > 1), pairs, device, workers
+    )
     return _in_order(done) if ordered else done
 
 
 class _Planner:
     """Prepares pairs, on many threads at once; repeated targets are prepared only once."""
 
-    def __init__(self, budget: int, seed: int, whole: bool):
+    def __init__(self, params: Params, scale: Scale, budget: int, seed: int, whole: bool):
+        self._params, self._scale = params, scale
         self._budget, self._seed, self._whole = budget, seed, whole
         self._clouds, self._units = Memo(_TARGET_CLOUDS), Memo(_TARGET_UNITS)
 
@@ -117,9 +124,11 @@ class _Planner:
             key = id(cloud), center.tobytes(), scale, motion.tobytes()
             return self._units.get(key, make)[1]
 
-        plan = planned(
+        plan = planned_at_scale(
+            self._params,
             source,
             target,
+            scale=self._scale,
             initial=initial,
             to_unit=to_unit,
             max_points=self._budget,

@@ -77,7 +77,7 @@ def add_parser(commands: Commands) -> None:
     how = parser.add_argument_group("how to register")
     clouds.add_columns(how)
     flags.add(how, "--no-refine", "--no-second-look", "--weights", "--max-points", "--thinned")
-    flags.add(how, "--seed")
+    flags.add(how, "--scale", "--seed")
     how.add_argument(
         "--batch-size",
         metavar="N",

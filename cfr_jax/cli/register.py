@@ -19,7 +19,8 @@ Finds the rigid motion that lays SOURCE on TARGET, and says how far to trust it.
 
 The answer T is a 4x4 matrix in the unit and the frames of the two files: for a point x of SOURCE,
 T @ [x; 1] lies on TARGET. The clouds may be of any size, unit and offset; they should show parts
-of the same object or place, at the same scale.
+of the same object or place, in the same unit. For different units, see --scale: then T maps the
+scaled source.
 """
 
 _EPILOG = """\
@@ -43,6 +44,7 @@ examples:
   cfr register a.ply b.ply --view page.html            rotate the result in a browser
   cfr register a.ply b.ply --initial previous.json     start from an earlier answer
   cfr register a.ply b.ply --global                    if they may be rotated by any angle
+  cfr register a.stl b.ply --scale auto                if they may have different units
   cfr register a.ply b.ply --strict || echo "look at it"
 """
 
@@ -70,7 +72,7 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         "--out",
         metavar="FILE",
         type=Path,
-        help="the moved source with all that its file holds "
+        help="the moved (and scaled) source with all that its file holds "
         f"({' '.join(outputs.cloud_suffixes())})",
     )
     written.add_argument(
@@ -114,9 +116,9 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         type=Path,
         action="append",
-        help="move the source by the 4x4 matrix in this file first: .txt with 16 numbers, .npy, or "
-        ".json (a matrix, or what --json wrote); the answer includes it; given several times, all "
-        "are tried",
+        help="move the (scaled) source by the 4x4 matrix in this file first: .txt with 16 numbers, "
+        ".npy, or .json (a matrix, or what --json wrote); the answer includes it; given several "
+        "times, all are tried",
     )
     where.add_argument(
         "--global",
@@ -131,7 +133,7 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     )
     flags.add(how, "--max-points", "--thinned")
     how.add_argument("--all-points", action="store_true", help=argparse.SUPPRESS)  # what it was
-    flags.add(how, "--no-second-look", "--seed")
+    flags.add(how, "--scale", "--no-second-look", "--seed")
     flags.add_strict(how, "the answer is not to be trusted; files are written anyway")
 
 

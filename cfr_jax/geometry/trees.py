@@ -10,6 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 _SAMPLED = 1 << 13  # points whose nearest neighbors tell the spacing of a cloud
+# Fewer queries than this are answered by one thread: sharing them takes longer, and very long if
+# other processes want the same cores.
+_SHARED = 1 << 14
 
 
 class Tree:
@@ -47,7 +50,8 @@ class Tree:
             distance, rows = self._of_scipy.query(queries, k, workers=-1)
             return rows.reshape(-1, k), distance.reshape(-1, k)
         search = self.of_library.batch_knn_search
-        rows, square = search(queries, k, num_threads=cores())
+        threads = cores() if len(queries) >= _SHARED else 1
+        rows, square = search(queries, k, num_threads=threads)
         return np.asarray(rows).astype(np.int64), np.sqrt(np.asarray(square))
 
     def closest(

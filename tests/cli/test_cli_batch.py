@@ -292,4 +292,4 @@ def test_thirty_kills_at_random_moments_leave_the_same_bytes(tmp_path):
 
 
 def test_columns_are_named_once():
-    assert len(set(records.COLUMNS)) == len(records.COLUMNS) == 26
+    assert len(set(records.COLUMNS)) == len(records.COLUMNS) == 28

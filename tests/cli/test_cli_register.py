@@ -79,6 +79,50 @@ def test_defaults_are_those_of_align(pair, answering):
     }
 
 
+@pytest.mark.parametrize(("text", "scale"), [("auto", "auto"), ("0.001", 0.001)])
+def test_the_scale_reaches_align(pair, answering, text, scale):
+    calls = answering()
+
+    assert main(["register", *pair, "--scale", text]) == 0
+
+    assert calls[0]["scale"] == scale
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "mm", ""])
+def test_a_scale_that_is_none_is_refused(pair, text, capsys):
+    code = main(["register", *pair, "--scale", text])
+
+    told = capsys.readouterr().err
+    assert code == 2 and "--scale" in told and "above 0, or auto" in told
+
+
+def test_a_scaled_answer_is_written_with_its_scale(pair, tmp_path, answering, capsys):
+    # given an answer with a factor, and a source with normals
+    answering(scale=0.001, scale_confidence=0.75)
+    points = cli_samples.points(700, 0)
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    io.write(tmp_path / "normals.ply", io.PointCloud(points, normals))
+
+    # when
+    out, told = tmp_path / "moved.ply", tmp_path / "told.json"
+    arguments = [str(tmp_path / "normals.ply"), pair[1], "--out", str(out), "--json", str(told)]
+    assert main(["register", *arguments, "--view", str(tmp_path / "page.html")]) == 0
+
+    # then the points are scaled and moved, and the normals are turned alone
+    moved, motion = io.read(out), cli_samples.motion()
+    wanted = 0.001 * points @ motion[:3, :3].T + motion[:3, 3]
+    np.testing.assert_allclose(moved.points, wanted, atol=1e-6)
+    np.testing.assert_allclose(moved.normals, normals @ motion[:3, :3].T, atol=1e-5)
+    document = json.loads(told.read_text())
+    jsonschema.validate(document, SCHEMA)
+    assert (document["scale"], document["scale_confidence"]) == (0.001, 0.75)
+    np.testing.assert_array_equal(document["transform"], motion)
+    np.testing.assert_allclose(document["similarity"], motion @ np.diag([1e-3, 1e-3, 1e-3, 1]))
+    printed = capsys.readouterr().out
+    assert "scale       0.001, millimeters to meters, estimated, confidence 0.75" in printed
+    assert "scaled source onto target" in printed
+
+
 def test_the_printed_transform_is_the_answer(pair, answering, capsys):
     # given
     answering()

@@ -7,7 +7,7 @@ A command picks its flags by name with `add`. `solving` and `weights_of` turn th
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from cfr_jax.cli.shared import numbers
 
@@ -41,6 +41,13 @@ _FLAGS: dict[str, dict[str, Any]] = {
         "action": "store_true",
         "help": "stop at the points that the network sees; otherwise, larger clouds are refined on "
         "all of their points at the end",
+    },
+    "--scale": {
+        "metavar": "auto|FACTOR",
+        "type": numbers.scale,
+        "default": 1.0,
+        "help": "multiply the source by this first, such as 0.001 for millimeters onto meters; "
+        "auto: estimate the factor, which takes about four times as long (default: 1)",
     },
     "--seed": {
         "metavar": "S",
@@ -79,6 +86,7 @@ class Solving(TypedDict):
     second_look: bool
     max_points: int | None
     all_points: bool
+    scale: float | Literal["auto"]
     seed: int
 
 
@@ -89,6 +97,7 @@ def solving(args: argparse.Namespace, refine: bool | str = True) -> Solving:
         "second_look": not args.no_second_look,
         "max_points": args.max_points,
         "all_points": not args.thinned,
+        "scale": args.scale,
         "seed": args.seed,
     }
 

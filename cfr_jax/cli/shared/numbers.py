@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Literal
 
 
 def positive(text: str) -> int:
@@ -24,6 +25,16 @@ def positive_real(text: str) -> float:
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"got {text!r}, wanted a number above 0")
     return value
+
+
+def scale(text: str) -> float | Literal["auto"]:
+    """The text as a number above 0, or "auto"; raises ArgumentTypeError for anything else."""
+    if text == "auto":
+        return "auto"
+    try:
+        return positive_real(text)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"{error}, or auto") from error
 
 
 def _whole(text: str, least: int) -> int:

@@ -14,6 +14,8 @@ from cfr_jax import __version__
 from cfr_jax.alignment.align import align
 from cfr_jax.alignment.answers import Alignment
 from cfr_jax.alignment.planning import Initial
+from cfr_jax.alignment.scaling import ratios
+from cfr_jax.alignment.scaling.planning import Scale
 from cfr_jax.cli.shared.flags import weights_of
 from cfr_jax.geometry import motions
 from cfr_jax.io import PointCloud
@@ -35,11 +37,12 @@ class Result:
     alignment: Alignment
 
     def moved_source(self) -> PointCloud:
-        """The whole source, moved onto the target, with all columns that it was read with."""
-        transform, source = self.alignment.transform, self.source
+        """The whole source, scaled and moved onto the target, with all columns of its file."""
+        transform, source = self.alignment.similarity, self.source
 
         def turned(normals: np.ndarray | None) -> np.ndarray | None:
-            return None if normals is None else motions.rotate(transform, normals)
+            rigid = self.alignment.transform
+            return None if normals is None else motions.rotate(rigid, normals)
 
         table = source.table
         if table is not None:
@@ -61,6 +64,7 @@ def register(
     max_points: int | None = None,
     all_points: bool = True,
     second_look: bool = True,
+    scale: Scale = 1.0,
     seed: int = 0,
 ) -> Result:
     """`align` with weights by name or path; raises ValueError like `align` and `read_weights`."""
@@ -74,6 +78,7 @@ def register(
         max_points=max_points,
         all_points=all_points,
         second_look=second_look,
+        scale=scale,
         seed=seed,
     )
     return Result(source, target, alignment.initial, seed, chosen, alignment)
@@ -88,6 +93,9 @@ def as_document(result: Result, source_path: str, target_path: str) -> dict[str,
         "source": _cloud(result.source, source_path, len(found.source_rows)),
         "target": _cloud(result.target, target_path, len(found.target_rows)),
         "transform": found.transform.tolist(),
+        "scale": found.scale,
+        "scale_confidence": found.scale_confidence,
+        "similarity": found.similarity.tolist(),
         "transforms": found.transforms.tolist(),
         "initial": None if result.initial is None else result.initial.tolist(),
         "starts": found.starts,
@@ -122,8 +130,9 @@ def as_text(result: Result) -> str:
     lines = [
         f"source      {result.source.name}: {_counts(result.source, len(found.source_rows))}",
         f"target      {result.target.name}: {_counts(result.target, len(found.target_rows))}",
-        "transform   source onto target, T @ [x; 1]:",
+        f"transform   {_scaled(found)}source onto target, T @ [x; 1]:",
         *("    " + _row(row) for row in found.transform),
+        *_scale(found),
         f"motion      {angle:.3f}° about one axis, translation {np.linalg.norm(translation):.6g}",
         *(f"{name:<11} {text}" for name, text in quality(found).items()),
         f"verdict     {verdict}",
@@ -155,7 +164,7 @@ def as_scene(result: Result, facts: Mapping[str, str] | None = None) -> Scene:
     weights = np.full(len(result.source), np.nan)  # NaN: a point the network did not see
     weights[found.source_rows] = found.weights
     return Scene(
-        source=result.source.points,
+        source=found.scale * result.source.points,
         target=result.target.points,
         transforms=stations,
         labels=labels,
@@ -185,6 +194,20 @@ def way(
         stations.append(refined)
         labels.append("refined")
     return stations, labels
+
+
+def _scaled(found: Alignment) -> str:
+    return "" if found.scale == 1 else "scaled "
+
+
+def _scale(found: Alignment) -> list[str]:
+    """The line about the factor of scale, if one was asked for."""
+    if found.scale == 1 and found.scale_confidence is None:
+        return []
+    sure = found.scale_confidence
+    told = [f"{found.scale:.7g}", ratios.in_words(found.scale)]
+    told.append("" if sure is None else f"estimated, confidence {sure:.2f}")
+    return [f"scale       {', '.join(filter(None, told))}"]
 
 
 def _cloud(cloud: PointCloud, path: str, used: int) -> dict[str, Any]:

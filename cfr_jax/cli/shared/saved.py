@@ -48,6 +48,8 @@ def read_result(path: Path) -> dict[str, Any]:
         for name, fits in _NEEDED.items():
             if name not in document or not fits(document[name]):
                 raise Refused(f'has no usable "{name}"')
+        if not _is_figure(document.get("scale", 1.0), _FARTHEST):
+            raise Refused('has no usable "scale"')
         _check_motions(document)
     except Refused as error:
         raise Refused(f"{shown(path)}: wanted what `cfr register --json` wrote: {error}") from error
@@ -150,7 +152,7 @@ def as_scene(document: dict[str, Any], source: PointCloud, target: PointCloud) -
         document["transform"] if document["refined"] else None,
     )
     return Scene(
-        source=source.points,
+        source=document.get("scale", 1.0) * source.points,
         target=target.points,
         transforms=stations,
         labels=labels,
@@ -166,7 +168,7 @@ def _doubts(document: dict[str, Any], source: PointCloud, target: PointCloud) ->
     yield from document["warnings"]
     rows = np.random.default_rng(0).permutation(len(source))[:_COMPARED]
     transform = np.asarray(document["transform"], np.float64)
-    moved = motions.apply(transform, source.points[rows])
+    moved = motions.apply(transform, document.get("scale", 1.0) * source.points[rows])
     away = cKDTree(target.points).query(moved)[0]
     fitness = float((away <= document["inlier_distance"]).mean())
     if fitness < document["fitness"] - _WORSE:
