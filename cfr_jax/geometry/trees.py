@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 _SAMPLED = 1 << 13  # points whose nearest neighbors tell the spacing of a cloud
-# Fewer queries than this are answered by one thread: sharing them takes longer, and very long if
-# other processes want the same cores.
-_SHARED = 1 << 14
+# Fewer queries than this are answered by one thread, within a quarter of a millisecond. To share
+# them would halve that, but cost a time slice where other processes want the same cores.
+_SHARED = 1 << 11
 
 
 class Tree:
