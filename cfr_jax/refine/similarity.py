@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from cfr_jax.geometry import motions
-from cfr_jax.refine import all_points
 from cfr_jax.refine.generalized_icp import CUT
-from cfr_jax.refine.surfaces import HostSurface
+from cfr_jax.refine.surfaces import HostSurface, score
 
 _NEIGHBORS = 16
 _CUTS = (3 * CUT, 2 * CUT, CUT)  # largest distances of pairs, in units of the unit sphere
@@ -106,10 +105,10 @@ def both_ways(source: HostSurface, target: HostSurface, found: Similarity) -> Pa
 
 def misfit(source: HostSurface, target: HostSurface, found: Similarity, cut: float) -> float:
     """How badly two clouds fit under `found`, in [0, 1]: the mean over both ways of
-    `all_points.score`, which is 1 if no point of one cloud is within the cut of the other."""
+    `surfaces.score`, which is 1 if no point of one cloud is within the cut of the other."""
     away = both_ways(source, target, found).away
     ways = away[: len(source.points)], away[len(source.points) :]
-    return sum(all_points.score(way, cut) for way in ways) / 2
+    return sum(score(way, cut) for way in ways) / 2
 
 
 def normals_of(surface: HostSurface) -> Float[np.ndarray, "n 3"]:

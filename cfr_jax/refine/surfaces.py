@@ -60,6 +60,12 @@ def closest(
     return source.once(key, lambda: target.tree.closest(motions.apply(transform, source.points)))
 
 
+def score(distance: Float[np.ndarray, " n"], cut: float) -> float:
+    """The same score as `generalized_icp.scores`, for these distances: 0 is best, and 1 means that
+    no point is within the cut."""
+    return float(np.mean(1 - (1 - np.minimum(distance / cut, 1) ** 2) ** 3))
+
+
 @struct.dataclass
 class Fit:
     """The answer of a refinement."""

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cfr_jax.geometry import motions
-from cfr_jax.refine import all_points, pyramid
+from cfr_jax.refine import all_points, pyramid, surfaces
 from cfr_jax.refine.surfaces import HostSurface
 
 TRUTH = solids.motion(20, (1.0, 2.0, 3.0), (0.1, -0.05, 0.2))
@@ -77,7 +77,7 @@ def test_it_never_scores_worse_than_its_start(library, seed):
 
     tree = cKDTree(still.points)
     away = [tree.query(solids.move(motion, moving.points))[0] for motion in (start, fine.transform)]
-    scores = [all_points.score(distance, 0.05) for distance in away]
+    scores = [surfaces.score(distance, 0.05) for distance in away]
     assert scores[1] <= scores[0] + 1e-3  # `refine` judges itself by a narrower cut than 0.05
     assert fine.improved or np.array_equal(fine.transform, start)
 
@@ -90,17 +90,49 @@ def test_what_would_score_worse_is_not_taken(library, monkeypatch):
         converged, iterations = True, 1
 
     monkeypatch.setattr(small_gicp, "align", lambda *_, **__: Away)
+    monkeypatch.setattr(all_points, "_SPARSE", 0)  # nothing but the library's answer
 
     fine = all_points.refine(source(1000), target(1000), START)
 
     assert not fine.improved and np.array_equal(fine.transform, START)
 
 
+def test_sparse_clouds_end_halfway_to_where_planes_lead(library, monkeypatch):
+    # given a last refinement that turns the answer by two degrees about the source's center, to
+    # where the clouds lie nearer to each other, as the misfit says
+    moving, center = source(1000), source(1000).points.mean(axis=0)
+    turned = solids.motion(2, translation=(0, 0, 0))
+    turned[:3, 3] = center - turned[:3, :3] @ center
+    misfits = iter([0.5, 0.4])
+    monkeypatch.setattr(
+        all_points.similarity,
+        "refine",
+        lambda _, __, found, **___: found._replace(motion=found.motion @ turned),
+    )
+    monkeypatch.setattr(all_points.similarity, "misfit", lambda *_: next(misfits))
+
+    # when
+    found = all_points._polished(moving, target(1000), TRUTH)
+
+    # then
+    assert solids.degrees_between(found, TRUTH) == pytest.approx(1)
+    np.testing.assert_allclose(solids.move(found, center), solids.move(TRUTH, center), atol=1e-12)
+
+
+def test_where_planes_lead_away_nothing_changes(library, monkeypatch):
+    away = solids.motion(20)
+    monkeypatch.setattr(
+        all_points.similarity, "refine", lambda _, __, found, **___: found._replace(motion=away)
+    )
+
+    assert all_points._polished(source(1000), target(1000), TRUTH) is TRUTH
+
+
 def test_the_score_is_the_mean_of_tukeys_loss():
     away = np.array([0.0, 0.5, 1.0, 7.0])
 
     # 1 - (1 - d^2)^3
-    assert all_points.score(away, 1.0) == pytest.approx((0 + 1 - 0.75**3 + 1 + 1) / 4)
+    assert surfaces.score(away, 1.0) == pytest.approx((0 + 1 - 0.75**3 + 1 + 1) / 4)
 
 
 @pytest.mark.parametrize("away", [0.0, 5.0], ids=["the same points twice", "nothing near"])
