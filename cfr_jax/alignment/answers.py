@@ -144,10 +144,10 @@ def answer(case: Case) -> Alignment:
     )
     probability, free = likely(len(rivals)), left_open(case)
     if free is None and doubts.trusted(probability):
-        around = basins.Surroundings(*_used(case), np.asarray(found.transform, np.float64))
+        around = surroundings(case)
         free = around.free_turn()
         if free is None and not len(rivals):
-            rivals = far_rivals(case, around)
+            rivals = frames.to_caller(around.rivals())
             probability = likely(len(rivals))
     neighbors = min(plan.source.neighbor_count, plan.target.neighbor_count)
     return Alignment(
@@ -208,18 +208,19 @@ def left_open(case: Case) -> Float[np.ndarray, " 6"] | None:
     return twists[resistance.argmin()] if resistance.min() < doubts.FREE else None
 
 
-def far_rivals(case: Case, around: basins.Surroundings) -> Float[np.ndarray, "r 4 4"]:
-    """Motions of the caller's clouds, far from the answer, that fit as well.
+def surroundings(case: Case) -> basins.Surroundings:
+    """Where other motions may fit as well as the answer, in the unit sphere.
 
     Without a search over all rotations, the answer is taken to lie within the network's reach of
-    where the source was given, and so are they.
+    where the source was given, and so are its rivals.
     """
     frames, searched = case.plan.frames, case.searched
     first, within = frames, _REACH
     if searched is not None:
         first, within = searched.frames, _REACH if searched.nearby else 180.0
     start = motions.motion(first.initial[:3, :3] @ frames.initial[:3, :3].T)
-    return frames.to_caller(around.rivals(start=start, within=within))
+    transform = np.asarray(case.solved().transform, np.float64)
+    return basins.Surroundings(*_used(case), transform, start=start, within=within)
 
 
 def _used(case: Case) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:

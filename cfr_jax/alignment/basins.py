@@ -10,6 +10,7 @@ well as before; a cube comes to rest on other sides.
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -48,10 +49,27 @@ _EVERY = 4  # one point in so many is used before the last steps
 Motion = Float[np.ndarray, "4 4"]
 
 
+class _Ends(NamedTuple):
+    """Motions at which iterative closest points ended, and how well each fits."""
+
+    motions: Float[np.ndarray, "k 4 4"]
+    fits: Float[np.ndarray, " k"]
+
+
+class _AllEnds(NamedTuple):
+    own: _Ends
+    """Of the answer: as it is, and where it comes to rest."""
+    turned: _Ends
+    """Of its turns about the principal axes."""
+    far: _Ends
+    """Of its far turns."""
+
+
 class Surroundings:
     """What lies around an answer: other motions that fit as well.
 
-    Both clouds lie in the unit sphere. All motions map source onto target.
+    Both clouds lie in the unit sphere. All motions map source onto target. Only motions whose
+    rotations are at most `within` degrees from that of `start` count as rivals.
     """
 
     def __init__(
@@ -59,9 +77,12 @@ class Surroundings:
         source: Float[np.ndarray, "n 3"],
         target: Float[np.ndarray, "m 3"],
         transform: Float[np.ndarray, "4 4"],
+        *,
+        start: Float[np.ndarray, "4 4"],
+        within: float,
     ):
         self._source, self._target = (Tree(_fewer(cloud)) for cloud in (source, target))
-        self._transform = transform
+        self._transform, self._start, self._within = transform, start, within
         self._reach = max(CUT, _REACH * max(self._source.spacing, self._target.spacing))
         self._cuts = np.geomspace(max(_WIDEST, self._reach), self._reach, _STEPS)
         self._some = self._source.points[::_EVERY]
@@ -72,53 +93,69 @@ class Surroundings:
         The twist has its rotation first and is in the target's frame. Turns by 30 degrees about the
         principal axes of the source are tried.
         """
-        moved = motions.apply(self._transform, self._source.points)
-        axes = np.linalg.eigh(np.cov(moved.T))[1].T
-        turns = motions.from_rotvec(_TURN * np.concatenate([axes, -axes]))
-        others = self._settled(_about(moved.mean(axis=0), turns) @ self._transform)
-        free = (self._fit(others) >= _TURNED * self._own_fit) & (self._away(others) > _APART)
+        others, fits = self._ends.turned
+        free = (fits >= _TURNED * self._own_fit) & (self._away(others) > _APART)
         if not free.any():
             return None
         twist = motions.to_rotvec(others[free.argmax(), :3, :3] @ self._transform[:3, :3].T)
         return np.concatenate([twist / np.linalg.norm(twist), np.zeros(3)])
 
-    def rivals(
-        self, *, start: Float[np.ndarray, "4 4"], within: float
-    ) -> Float[np.ndarray, "r 4 4"]:
+    def rivals(self) -> Float[np.ndarray, "r 4 4"]:
         """Motions far from the answer that fit at least 0.9 times as well, the best one first.
 
         The source is turned by rotations that cover SO(3), about the middle of its points that lie
         on the target. The turns that fit best, told by a grid of distances to the target, are
-        brought to rest by iterative closest points. Only motions whose rotations are at most
-        `within` degrees from that of `start` count.
+        brought to rest by iterative closest points.
         """
-        others = self._at_rest(self._promising(start, within))
-        fits = self._fit(others)
+        others, fits = self._ends.far
         counts = (fits >= _RIVAL * self._own_fit) & (self._away(others) > _SAME)
-        counts &= motions.angle_between(others, start) <= within
+        counts &= motions.angle_between(others, self._start) <= self._within
         return _apart(others[counts], fits[counts], _BEST)
 
-    def _promising(self, start: Motion, within: float) -> Float[np.ndarray, "k 4 4"]:
-        """The best of the far turns of the answer, before the last steps that bring them to
-        rest."""
+    @property
+    def _own_fit(self) -> float:
+        """The fit of the answer, or of the place near it where it comes to rest, if that is
+        better."""
+        places, fits = self._ends.own
+        return float(fits[self._away(places) < _APART].max())
+
+    @functools.cached_property
+    def _ends(self) -> _AllEnds:
+        """All motions take their steps together, which takes half the time of one after the
+        other."""
+        answer, axes, far = self._transform[None], self._about_axes(), self._far_turns()
+        first = 1 + len(axes)
+        approached = self._stepped(
+            np.concatenate([answer, axes, far]), self._some, self._cuts[:_APPROACH]
+        )
+        near = _apart(approached[first:], self._fit(approached[first:]), _BEST)
+        rested = self._stepped(
+            np.concatenate([approached[:first], near]), self._source.points, self._cuts[_APPROACH:]
+        )
+        found = np.concatenate([answer, rested])
+        fits = self._fit(found)
+        own, turned, others = np.split(np.arange(len(found)), [2, 1 + first])
+        return _AllEnds(*(_Ends(found[rows], fits[rows]) for rows in (own, turned, others)))
+
+    def _about_axes(self) -> Float[np.ndarray, "6 4 4"]:
+        """The answer, turned about the principal axes of the source."""
+        moved = motions.apply(self._transform, self._source.points)
+        axes = np.linalg.eigh(np.cov(moved.T))[1].T
+        turns = motions.from_rotvec(_TURN * np.concatenate([axes, -axes]))
+        return _about(moved.mean(axis=0), turns) @ self._transform
+
+    def _far_turns(self) -> Float[np.ndarray, "k 4 4"]:
+        """The turns of the answer over all of SO(3) that fit best."""
         moved = motions.apply(self._transform, self._source.points)
         near = self._target.closest(moved)[1] <= self._reach
         center = moved[near if near.any() else slice(None)].mean(axis=0)
         turned = _about(center, _ROTATIONS) @ self._transform
         # what ends within the limit may start a little beyond it
-        allowed = motions.angle_between(turned, start) <= within + _SAME
+        allowed = motions.angle_between(turned, self._start) <= self._within + _SAME
         turned = turned[allowed & (self._away(turned) > _SAME)]
         away = self._looked_up(_moved(turned, self._some))
         fits = np.mean(np.maximum(1 - (away / max(_COARSE, self._reach)) ** 2, 0), axis=1)
-        approached = self._approached(_apart(turned, fits, _TRIED))
-        return _apart(approached, self._fit(approached), _BEST)
-
-    @functools.cached_property
-    def _own_fit(self) -> float:
-        """The fit of the answer, or of the place near it where it comes to rest, if that is
-        better."""
-        places = np.stack([self._transform, self._settled(self._transform[None])[0]])
-        return float(self._fit(places)[self._away(places) < _APART].max())
+        return _apart(turned, fits, _TRIED)
 
     def _away(self, others: Float[np.ndarray, "k 4 4"]) -> Float[np.ndarray, " k"]:
         """The angles between motions and the answer, in degrees."""
@@ -132,19 +169,6 @@ class Surroundings:
         _, here = _closest(self._source, _moved(back, self._target.points))
         shares = [np.mean(np.maximum(1 - (d / self._reach) ** 2, 0), axis=1) for d in (there, here)]
         return np.mean(shares, axis=0)
-
-    def _settled(self, starts: Float[np.ndarray, "k 4 4"]) -> Float[np.ndarray, "k 4 4"]:
-        """The motions at which iterative closest points end. The cut on the distance of pairs
-        shrinks from `_WIDEST` to the reach."""
-        return self._at_rest(self._approached(starts))
-
-    def _approached(self, starts: Float[np.ndarray, "k 4 4"]) -> Float[np.ndarray, "k 4 4"]:
-        """The motions after the first steps, which need only some of the points."""
-        return self._stepped(starts, self._some, self._cuts[:_APPROACH])
-
-    def _at_rest(self, approached: Float[np.ndarray, "k 4 4"]) -> Float[np.ndarray, "k 4 4"]:
-        """The motions after the last steps, with all points."""
-        return self._stepped(approached, self._source.points, self._cuts[_APPROACH:])
 
     def _stepped(
         self,

@@ -9,7 +9,11 @@ from scipy.spatial.transform import Rotation
 from cfr_jax.alignment import basins
 from cfr_jax.geometry import motions
 
-RNG = np.random.default_rng(0)
+HERE = np.eye(4)
+
+
+def around(source, target, transform, *, start=HERE, within=180.0):
+    return basins.Surroundings(source, target, transform, start=start, within=within)
 
 
 def unit(points):
@@ -27,7 +31,7 @@ def two(draw, count=500):
 def test_a_solid_of_revolution_turns_freely(name):
     source, target = two(hard_cases.REVOLVED[name])
 
-    twist = basins.Surroundings(source, target, np.eye(4)).free_turn()
+    twist = around(source, target, np.eye(4)).free_turn()
 
     assert twist is not None
     if name not in ("sphere", "spheroid"):
@@ -37,15 +41,15 @@ def test_a_solid_of_revolution_turns_freely(name):
 def test_a_shape_without_symmetry_does_not():
     source, target = two(lambda count, rng: solids.lopsided(count, rng.integers(99)).points)
 
-    assert basins.Surroundings(source, target, np.eye(4)).free_turn() is None
+    assert around(source, target, np.eye(4)).free_turn() is None
 
 
 def test_the_answer_does_not_depend_on_the_frame():
     source, target = two(hard_cases.REVOLVED["torus"])
     turned = solids.motion(70, translation=(0, 0, 0))
 
-    here = basins.Surroundings(source, target, np.eye(4)).free_turn()
-    there = basins.Surroundings(source, solids.move(turned, target), turned).free_turn()
+    here = around(source, target, np.eye(4)).free_turn()
+    there = around(source, solids.move(turned, target), turned).free_turn()
 
     np.testing.assert_allclose(abs(turned[:3, :3] @ here[:3] @ there[:3]), 1, atol=0.02)
 
@@ -54,7 +58,7 @@ def test_closest_points_bring_a_turned_shape_back():
     points = unit(solids.lopsided(500, 0).points)
     start = motions.motion(motions.from_rotvec(np.radians([0, 0, 12.0])), np.array([0.02, 0, 0]))
 
-    found = basins.Surroundings(points, points, start)._settled(start[None])[0]
+    found = around(points, points, start)._ends.own.motions[1]
 
     assert solids.degrees_between(found, np.eye(4)) < 1
 
@@ -74,7 +78,7 @@ def about_diagonal(degrees):
 def test_a_notched_cube_has_rivals_a_third_of_a_turn_away():
     source, target = two(notched)
 
-    found = basins.Surroundings(source, target, np.eye(4)).rivals(start=np.eye(4), within=180.0)
+    found = around(source, target, np.eye(4)).rivals()
 
     thirds = [about_diagonal(turn) for turn in (120, 240)]
     assert len(found) >= 1
@@ -84,11 +88,11 @@ def test_a_notched_cube_has_rivals_a_third_of_a_turn_away():
 
 def test_a_rival_beyond_the_reach_does_not_count():
     source, target = two(notched)
-    around = basins.Surroundings(source, target, np.eye(4))
 
-    assert len(around.rivals(start=np.eye(4), within=90.0)) == 0
+    assert len(around(source, target, np.eye(4), within=90.0).rivals()) == 0
     # from a start in between, one of them is within reach
-    (found,) = around.rivals(start=about_diagonal(60), within=90.0)
+    between = around(source, target, np.eye(4), start=about_diagonal(60), within=90.0)
+    (found,) = between.rivals()
     assert solids.degrees_between(found, about_diagonal(120)) < 5
 
 
@@ -96,7 +100,7 @@ def test_a_better_place_is_a_rival_and_comes_first():
     source, target = two(notched)
     wrong = motions.motion(motions.from_rotvec(np.radians([0, 0, 90.0])))
 
-    found = basins.Surroundings(source, target, wrong).rivals(start=np.eye(4), within=90.0)
+    found = around(source, target, wrong, within=90.0).rivals()
 
     assert solids.degrees_between(found[0], np.eye(4)) < 5
 
@@ -104,7 +108,7 @@ def test_a_better_place_is_a_rival_and_comes_first():
 def test_a_shape_without_symmetry_has_no_rivals():
     source, target = two(lambda count, rng: solids.lopsided(count, rng.integers(99)).points)
 
-    found = basins.Surroundings(source, target, np.eye(4)).rivals(start=np.eye(4), within=180.0)
+    found = around(source, target, np.eye(4)).rivals()
 
     assert found.shape == (0, 4, 4)
 
