@@ -13,8 +13,8 @@ import zlib
 from collections.abc import Callable
 
 import numpy as np
-from amplifying_games import game_makers
 from amplifying_meshes import mesh_makers
+from game_samples import game_makers
 from kind_samples import npy
 
 Maker = Callable[[int, random.Random], bytes]
