@@ -4,6 +4,7 @@ import mesh_samples as samples
 import numpy as np
 import pytest
 
+from cfr_jax.data.making import furniture
 from cfr_jax.data.making.ac3d import parse_ac3d
 from cfr_jax.data.making.furniture import CATALOG, FurnitureLibrary
 from cfr_jax.data.making.mesh_formats import mesh_formats
@@ -218,6 +219,16 @@ def test_a_damaged_library_is_refused(tmp_path, catalog, message):
         if catalog is not None:
             archive.writestr(CATALOG, catalog)
     with pytest.raises(ValueError, match=message):
+        FurnitureLibrary(path)
+
+
+def test_what_unpacks_to_more_than_a_model_has_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(furniture, "LARGEST_MODEL", 1000)
+    path = tmp_path / "library.sh3f"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(CATALOG, "\n" * 1001)
+
+    with pytest.raises(ValueError, match="unpacks to 1001 bytes, wanted at most 1000"):
         FurnitureLibrary(path)
 
 

@@ -53,7 +53,7 @@ class FurnitureLibrary:
         self.path = path
         try:
             self._zip = zipfile.ZipFile(path)
-            text = self._zip.read(CATALOG).decode("latin1")
+            text = content_of(self._zip, CATALOG).decode("latin1")
         except (OSError, zipfile.BadZipFile, KeyError) as error:
             raise ValueError(f"{path} is not a furniture library (SH3F): {error}") from error
         self.pieces: tuple[Piece, ...] = _pieces(text, path)
@@ -107,19 +107,21 @@ def _unescaped(match: re.Match[str]) -> str:
 
 def _model(archive: zipfile.ZipFile, name: str) -> bytes:
     try:
-        data = _content(archive, name)
+        data = content_of(archive, name)
         if not zipfile.is_zipfile(io.BytesIO(data)) or name.lower().endswith(".obj"):
             return data
         with zipfile.ZipFile(io.BytesIO(data)) as nested:
             models = [inner for inner in nested.namelist() if inner.lower().endswith(".obj")]
             if not models:
                 raise ValueError(f"{name} holds no OBJ file")
-            return _content(nested, models[0])
+            return content_of(nested, models[0])
     except (KeyError, zipfile.BadZipFile) as error:
         raise ValueError(f"cannot read {name}: {error}") from error
 
 
-def _content(archive: zipfile.ZipFile, name: str) -> bytes:
+def content_of(archive: zipfile.ZipFile, name: str) -> bytes:
+    """The bytes of a file in an archive. Raises ValueError if they are many more than a model
+    has."""
     size = archive.getinfo(name).file_size
     if size > LARGEST_MODEL:
         raise ValueError(f"{name} unpacks to {size} bytes, wanted at most {LARGEST_MODEL}")

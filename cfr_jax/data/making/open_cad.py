@@ -19,7 +19,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from cfr_jax.data.making.build import Report, build
-from cfr_jax.data.making.furniture import FurnitureLibrary
+from cfr_jax.data.making.furniture import FurnitureLibrary, content_of
 from cfr_jax.data.making.meshes import parse_pmd, read_mesh
 from cfr_jax.data.making.packages import download, extract, find_deb, version_of
 from cfr_jax.data.making.samples import Item
@@ -189,7 +189,7 @@ def _game_items(archive: zipfile.ZipFile) -> Iterator[Item]:
 
 
 def _game_mesh(archive: zipfile.ZipFile, entry: str, name: str) -> Mesh:
-    return parse_pmd(archive.read(entry), name)
+    return parse_pmd(content_of(archive, entry), name)
 
 
 def _furniture_items(library: FurnitureLibrary, stem: str) -> Iterator[Item]:
