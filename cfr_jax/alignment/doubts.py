@@ -126,15 +126,17 @@ def _sizes_in_words(size_ratio: float, spacing_ratio: float | None) -> str:
     larger, smaller, times = "source", "target", size_ratio
     if size_ratio < 1:
         larger, smaller, times = "target", "source", 1 / size_ratio
-    told = f"the {larger} is {times:.3g} times as large as the {smaller}"
+    told = f"the {larger} is {times:.3g} times as large as the {smaller}: same units?"
     unit = ratios.nearest(1 / size_ratio)
     fits = abs(math.log(size_ratio * unit.factor)) <= math.log(_PARTS_APART)
     if spacing_ratio is not None:
         same = abs(math.log(spacing_ratio))
         if same <= math.log(_SPACINGS_APART):
-            return f"{told}, with points as dense: if it shows much more, cut the rest off"
+            return (
+                f"the {larger} is {times:.3g} times as large as the {smaller}, with points as "
+                "dense: if it shows much more, cut the rest off"
+            )
         fits = fits and abs(math.log(spacing_ratio * unit.factor)) <= math.log(_SPACINGS_APART)
-    told += ": same units?"
     if not fits:
         return told
     return (
