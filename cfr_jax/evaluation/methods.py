@@ -26,7 +26,7 @@ _DRAWING = {"fgr", "fgr_icp", "ransac"}
 _PEERS = ("evaluation/baselines/*.py", "data/scans.py")
 _OURS = (
     *_PEERS,
-    "alignment/*.py",
+    "alignment/**/*.py",
     "geometry/*.py",
     "io/cloud.py",
     "networks/**/*.py",
