@@ -51,7 +51,7 @@ def methods() -> dict[str, MethodEntry]:
         "ransac": MethodEntry("ransac", features, threads=1),
         "kiss_matcher": MethodEntry("kiss_matcher", {"voxel": 1.0}, threads=1),
         "cfr": MethodEntry("cfr", network),
-        "cfr_align": MethodEntry("cfr", {"through": "align"}),  # what a user gets
+        "cfr_align": MethodEntry("cfr", {"through": "align", "refine": True}),
         "cfr_estimated": MethodEntry("cfr", network, estimated_normals=True),
         "rpmnet": MethodEntry("rpmnet", prepared | {"settings": {"optimized": False}}),
         "rpmnet_optim": MethodEntry("rpmnet", prepared),

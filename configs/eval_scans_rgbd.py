@@ -43,7 +43,7 @@ def methods() -> dict[str, MethodEntry]:
         "ransac": MethodEntry("ransac", features | {"distance": 0.075}, threads=1),
         "kiss_matcher": MethodEntry("kiss_matcher", {"voxel": 0.05}, threads=1),
         "cfr": MethodEntry("cfr", network | {"refine": False}),
-        "cfr_align": MethodEntry("cfr", {"through": "align"}),  # what a user gets
+        "cfr_align": MethodEntry("cfr", {"through": "align", "refine": True}),
         "rpmnet": MethodEntry("rpmnet", prepared | {"settings": {"optimized": False}}),
         "rpmnet_optim": MethodEntry("rpmnet", prepared),
         # of clouds whose pairs of points are too many to be stored, DCP and RGM say so
