@@ -13,6 +13,7 @@ from cfr_jax.alignment import basins, confidence, doubts, measuring, quality, se
 from cfr_jax.alignment.case import Case
 from cfr_jax.geometry import motions
 from cfr_jax.networks.probability import calibration_of
+from cfr_jax.refine.similarity import Similarity
 from cfr_jax.runtime.values import ByValue
 
 _REACH = 90.0  # degrees: turns by up to 45 about each of three axes stay within
@@ -92,7 +93,7 @@ class Alignment(ByValue):
     def similarity(self) -> Float[np.ndarray, "4 4"]:
         """Maps source onto target with its scale: `similarity @ [x; 1]` lies on the target. Equal
         to `transform` if `scale` is 1."""
-        return self.transform @ np.diag([self.scale, self.scale, self.scale, 1.0])
+        return Similarity(self.scale, self.transform).matrix
 
     @property
     def trusted(self) -> bool:

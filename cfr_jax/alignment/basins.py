@@ -123,7 +123,8 @@ class Surroundings:
     def _ends(self) -> _AllEnds:
         """All motions take their steps together, which takes half the time of one after the
         other."""
-        answer, axes, far = self._transform[None], self._about_axes(), self._far_turns()
+        moved = motions.apply(self._transform, self._source.points)
+        answer, axes, far = self._transform[None], self._about_axes(moved), self._far_turns(moved)
         first = 1 + len(axes)
         approached = self._stepped(
             np.concatenate([answer, axes, far]), self._some, self._cuts[:_APPROACH]
@@ -137,16 +138,14 @@ class Surroundings:
         own, turned, others = np.split(np.arange(len(found)), [2, 1 + first])
         return _AllEnds(*(_Ends(found[rows], fits[rows]) for rows in (own, turned, others)))
 
-    def _about_axes(self) -> Float[np.ndarray, "6 4 4"]:
-        """The answer, turned about the principal axes of the source."""
-        moved = motions.apply(self._transform, self._source.points)
+    def _about_axes(self, moved: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "6 4 4"]:
+        """The answer, turned about the principal axes of the moved source."""
         axes = np.linalg.eigh(np.cov(moved.T))[1].T
         turns = motions.from_rotvec(_TURN * np.concatenate([axes, -axes]))
         return _about(moved.mean(axis=0), turns) @ self._transform
 
-    def _far_turns(self) -> Float[np.ndarray, "k 4 4"]:
-        """The turns of the answer over all of SO(3) that fit best."""
-        moved = motions.apply(self._transform, self._source.points)
+    def _far_turns(self, moved: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 4 4"]:
+        """The turns of the moved source over all of SO(3) that fit best."""
         near = self._target.closest(moved)[1] <= self._reach
         center = moved[near if near.any() else slice(None)].mean(axis=0)
         turned = _about(center, _ROTATIONS) @ self._transform

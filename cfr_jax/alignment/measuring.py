@@ -56,7 +56,7 @@ def misfit(
     """How badly two clouds fit under `transform` (source onto target), in [0, 1].
 
     It is the mean of two losses: from the source's points to the target, and from the target's
-    points to the source. Each is an `surfaces.score`. Its cut is twice the wider of the two point
+    points to the source. Each is a `surfaces.score`. Its cut is twice the wider of the two point
     spacings, but at most `distance`. Both directions are needed because a small part fits well on
     any dense part of a large cloud. If a cloud has more than `_ASKED` points, only every second,
     third, ... point is used.

@@ -93,16 +93,12 @@ def _polished(
     """
     if max(len(source.points), len(target.points)) > _SPARSE:
         return transform
-    found = similarity.refine(
-        source, target, Similarity(1.0, transform), cuts=_CUTS, keep_factor=True
-    )
     cut = min(CUT, _SPACINGS * max(source.tree.spacing, target.tree.spacing))
     if not cut > 0:
         return transform
-    before, after = (
-        similarity.misfit(source, target, Similarity(1.0, motion), cut)
-        for motion in (transform, found.motion)
-    )
+    start = Similarity(1.0, transform)
+    found = similarity.refine(source, target, start, cuts=_CUTS, keep_factor=True)
+    before, after = (similarity.misfit(source, target, each, cut) for each in (start, found))
     return _halfway(transform, found.motion, source) if after < before else transform
 
 
